@@ -1,6 +1,7 @@
 """The page of ``cvtgs view`` without a browser, on a stand-in for viser."""
 
 import math
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -45,6 +46,12 @@ def page(scene: GaussianScene) -> Iterator[Any]:
 
 def control(page: Any, label: str) -> Any:
     return page.stand.gui.controls[label]
+
+
+def notes(page: Any) -> str:
+    """Return the text of the notes, in which punctuation is escaped, as the page shows it."""
+    content: str = control(page, NOTES).content
+    return re.sub(r"\\([!-/:-@\[-`{-~])", r"\1", content)
 
 
 def until(condition: Callable[[], bool]) -> None:
@@ -119,12 +126,27 @@ def test_presets_and_scenes_can_be_switched(page: Any) -> None:
 
 
 @pytest.mark.slow
+def test_too_little_memory_is_an_error_on_the_page(
+    page: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> ShownScene:
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SceneViewer, "simplify", fail)
+        control(page, "log10 of rho").value = -1.5
+        until(lambda: "this needs more memory than is available" in notes(page))
+    control(page, "log10 of rho").value = -2.0
+    until(lambda: control(page, FACTS).content.startswith("5 of 500 Gaussians"))
+
+
+@pytest.mark.slow
 def test_the_current_view_is_scored(page: Any) -> None:
     camera = SimpleNamespace(wxyz=(1, 0, 0, 0), position=(0, 0, -4), fov=0.8, aspect=1.5)
     control(page, "PSNR of this view").call(SimpleNamespace(camera=camera))
-    assert control(page, NOTES).content.startswith("simplified: ")
+    assert notes(page).startswith("simplified: ")
     view = camera_of((1, 0, 0, 0), (0, 0, -4), fov=0.8, aspect=1.5)
-    assert f"{page.viewer.score('simplified', view):.2f} dB" in control(page, NOTES).content
+    assert f"{page.viewer.score('simplified', view):.2f} dB" in notes(page)
     assert page.viewer.score("full scene", view) > 60
 
 
@@ -134,11 +156,20 @@ def test_the_shown_scene_is_saved(page: Any, tmp_path: Path) -> None:
     control(page, "file").value = str(path)
     for said in (f"{path}: 50 Gaussians.", "must not exist yet, found a file"):
         control(page, "save this scene").call()
-        assert said in control(page, NOTES).content
+        assert said in notes(page)
     assert same_bits(load(path), page.viewer.scenes["simplified"].scene)
     control(page, "file").value = "  "
     control(page, "save this scene").call()
-    assert control(page, NOTES).content == "**a file name is needed to save a scene, found none.**"
+    assert notes(page) == "**a file name is needed to save a scene, found none.**"
+
+
+@pytest.mark.slow
+def test_markup_in_names_is_not_interpreted(page: Any, tmp_path: Path) -> None:
+    path = tmp_path / "*a* <iframe srcdoc='<img src=x onerror=f()>'> `b`.ply"
+    control(page, "file").value = str(path)
+    control(page, "save this scene").call()
+    assert notes(page) == f"{path}: 50 Gaussians."
+    assert not re.search(r"(?<!\\)[<>*`_]", control(page, NOTES).content)
 
 
 @pytest.mark.slow
@@ -196,6 +227,15 @@ def test_the_camera_of_a_view_equals_that_by_hand() -> None:
     torch.testing.assert_close(point, torch.tensor([0, 0, 4, 1], dtype=torch.float64))
     wanted = [[120.0, 0, 240], [0, 120, 120], [0, 0, 1]]
     torch.testing.assert_close(cameras.Ks[0], torch.tensor(wanted, dtype=torch.float64))
+
+
+def test_a_scene_that_is_not_there_yet_is_an_error(scene: GaussianScene, tmp_path: Path) -> None:
+    viewer = SceneViewer(scene, device="cpu")
+    view = camera_of((1, 0, 0, 0), (0, 0, -4), fov=0.8, aspect=1.5)
+    with pytest.raises(InvalidArgumentError, match="the scene 'simplified' does not exist, or not"):
+        viewer.score("simplified", view)
+    with pytest.raises(InvalidArgumentError, match="the scene 'simplified' does not exist, or not"):
+        viewer.save("simplified", tmp_path / "a.ply")
 
 
 def test_names_reserved_by_the_viewer_are_refused(scene: GaussianScene) -> None:

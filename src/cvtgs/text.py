@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Any
+from unicodedata import combining, east_asian_width
 
 _UNSAFE = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
@@ -56,6 +57,17 @@ def suggestion(word: str, choices: Iterable[str], *, likeness: float = 0.6) -> s
     """Return "; did you mean X?" with the choice closest to a word; empty if none is close."""
     near = get_close_matches(word, list(choices), n=1, cutoff=likeness)
     return f"; did you mean {near[0]}?" if near else ""
+
+
+def padded(text: str, width: int) -> str:
+    """Pad a text to a width in columns of a terminal, where wide characters take two."""
+    return text + " " * (width - columns(text))
+
+
+def columns(text: str) -> int:
+    """Return the number of columns that a text takes in a terminal."""
+    wide = sum(east_asian_width(letter) in "FW" for letter in text)
+    return len(text) + wide - sum(map(bool, map(combining, text)))
 
 
 def counted(number: int, word: str) -> str:

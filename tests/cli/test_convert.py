@@ -48,6 +48,16 @@ def test_a_ply_loses_nothing(
     assert target.read_bytes() == source.read_bytes()
 
 
+def test_a_comment_that_is_left_out_counts_as_a_loss(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, data = tmp_path / "source.ply", (DATA / "source.ply").read_bytes()
+    source.write_bytes(data.replace(b"end_header", b"comment made by hand\nend_header", 1))
+    assert main(["convert", str(source), str(tmp_path / "a.spz")]) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert "without 1 comment Lost: nothing else." in words
+
+
 def test_quiet_prints_only_warnings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["convert", str(DATA / "source.ply"), "--quiet"]
     assert main([*words, str(tmp_path / "a.spz")]) == 0

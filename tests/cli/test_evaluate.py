@@ -168,6 +168,16 @@ def test_scenes_of_the_same_name_are_printed_with_their_paths(scenes, tmp_path, 
     assert str(tmp_path / "full.ply") in capsys.readouterr().out
 
 
+def test_names_of_wide_and_combining_letters_are_aligned(scenes, tmp_path, capsys):
+    names = ["\u5ead\u5712.ply", "u\u0308ber.ply", "garden.ply"]  # 8, 8 and 10 columns
+    for name in names:
+        (tmp_path / name).write_bytes((tmp_path / scenes[1]).read_bytes())
+    words = [scenes[0], *(str(tmp_path / name) for name in names), *SMALL, "--lpips", "off"]
+    assert main(["evaluate", *words]) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if ".ply   " in line]
+    assert [row.partition("  200 ")[0].count(" ") for row in rows] == [13, 13, 11]
+
+
 def test_render_writes_a_png_per_view(scenes, tmp_path, capsys):
     words = ["render", scenes[0], "-o", str(tmp_path / "new"), *SMALL]
     assert main([*words, "--background", "0,0,1"]) == 0

@@ -310,7 +310,7 @@ def test_sheets_hold_every_image(comparison):
     full = comparison.full.colors[1]
     windows = np.lib.stride_tricks.sliding_window_view(sheet, full.shape)[:, :, 0]
     assert (windows == full).all(axis=(2, 3, 4)).any()
-    assert errors.shape[1] == sheet.shape[1]
+    assert errors.shape[1] >= sheet.shape[1]
 
 
 def data_of(page: str) -> dict:

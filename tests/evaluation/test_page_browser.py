@@ -138,15 +138,18 @@ def test_the_page_loads_nothing_from_the_network(page):
 
 
 @pytest.mark.slow
-def test_a_larger_scene_has_more_gaussians(tmp_path):
+def test_ratios_of_other_sizes_are_told_apart(tmp_path):
     scene = cvtgs.synthetic.scene("object", 300, sh_degree=0, seed=0)
     cameras, settings = (
         automatic_views(scene, 1, width=32, height=24),
         EvaluationSettings(lpips="off"),
     )
     small = scene.select(torch.arange(50))
-    write_comparison(compare(small, {"larger": scene}, cameras, settings=settings), tmp_path)
-    assert "<b>6\u00d7 more</b>" in dom(tmp_path / "index.html")
+    others = {"larger": scene, "hardly smaller": small.select(torch.arange(49))}
+    write_comparison(compare(small, others, cameras, settings=settings), tmp_path)
+    html = dom(tmp_path / "index.html")
+    assert "<b>6\u00d7 more</b>" in html
+    assert "<b>1.02\u00d7 fewer</b>" in html
 
 
 @pytest.mark.slow

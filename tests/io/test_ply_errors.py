@@ -2,6 +2,7 @@
 
 import contextlib
 import random
+import sys
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cvtgs.errors import DroppedDataWarning, FileFormatError
+from cvtgs.errors import DroppedDataWarning, FileFormatError, MissingDependencyError
 from cvtgs.io import load
 from cvtgs.io.ply.header import MAX_HEADER_BYTES
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
@@ -295,3 +296,19 @@ def test_random_damage_is_a_scene_or_a_format_error(tmp_path: Path) -> None:
             contextlib.suppress(FileFormatError, DroppedDataWarning),
         ):
             load(path)
+
+
+def test_without_plyfile_unusual_files_say_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "plyfile", None)
+    plain, unusual = tmp_path / "plain.ply", tmp_path / "ascii.ply"
+    plain.write_bytes(GOOD)
+    unusual.write_bytes(ASCII)
+    assert len(load(plain)) == 3
+    with pytest.raises(MissingDependencyError) as caught:
+        load(unusual)
+    assert str(caught.value) == (
+        f"{unusual}: a PLY that is not plain binary needs the package plyfile; "
+        "install it with python -m pip install plyfile."
+    )

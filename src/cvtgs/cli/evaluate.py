@@ -27,7 +27,7 @@ from cvtgs.cli.view import PAGE, check_page, write_page
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import windows_fault
 from cvtgs.progress import ProgressEvent
-from cvtgs.text import counted, printable
+from cvtgs.text import columns, counted, padded, printable
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation, SceneScores
@@ -191,7 +191,7 @@ def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
 
 
 def _print_score_table(scenes: "tuple[SceneScores, ...]", sizes: dict[str, int]) -> None:
-    width = max(len(scene.name) for scene in scenes)
+    width = max(columns(scene.name) for scene in scenes)
     heads = (
         f"  {'':{width}}  {'Gaussians':>12}  {'size':>9}  {'PSNR':>6}  {'SSIM':>6}  {'LPIPS':>6}"
     )
@@ -199,8 +199,9 @@ def _print_score_table(scenes: "tuple[SceneScores, ...]", sizes: dict[str, int])
     say(f"{heads}  {'alpha':>6}  {'bias':>7}" if with_alpha else heads)
     for scene in scenes:
         distance = f"{scene.lpips.mean:.4f}" if scene.lpips else "-"
+        name = padded(scene.name, width)
         line = (
-            f"  {scene.name:{width}}  {scene.count:>12,}  {size_text(sizes[scene.name]):>9}  "
+            f"  {name}  {scene.count:>12,}  {size_text(sizes[scene.name]):>9}  "
             f"{scene.psnr.mean:>6.2f}  {scene.ssim.mean:>6.4f}  {distance:>6}"
         )
         if scene.alpha_error and scene.alpha_bias:
@@ -262,11 +263,11 @@ def add_tradeoff(add_parser: AddParser) -> None:
         "tradeoff",
         help="run all presets on a scene and show quality against time",
         description="Simplify IN with every preset, each run in its own process, score the results "
-        "against IN, print a table, and write tradeoff.csv, tradeoff.json, tradeoff.png and "
-        f"index.html, a single file that works offline. At most {MOST_CAMERAS} of the --cameras "
-        "are used, unless --views sets another number. If the cameras beside IN have a test split "
-        "(every eighth, for example), it scores, and presets that use images are fitted to the "
-        "others.",
+        "against IN, print a table, and write tradeoff.csv, tradeoff.json, tradeoff.png (needs the "
+        "extra plots) and index.html, a single file that works offline. At most "
+        f"{MOST_CAMERAS} of the --cameras are used, unless --views sets another number. If the "
+        "cameras beside IN have a test split (every eighth, for example), it scores, and presets "
+        "that use images are fitted to the others.",
     )
     parser.set_defaults(run=tradeoff)
     add_options(parser, "input", "--rho")
@@ -318,13 +319,11 @@ def _print_tradeoff(tradeoff: "Tradeoff") -> None:
 
     for rho in tradeoff.ratios:
         say(heading(tradeoff, rho))
-        columns = [cells(tradeoff, result) for result in tradeoff.results if result.rho == rho]
-        left = max(len(name) for name in columns[0])
-        widths = [max(map(len, column.values())) for column in columns]
-        for name in columns[0]:
-            words = (
-                f"{column[name]:>{width}}" for column, width in zip(columns, widths, strict=True)
-            )
+        runs = [cells(tradeoff, result) for result in tradeoff.results if result.rho == rho]
+        left = max(len(name) for name in runs[0])
+        widths = [max(map(len, run.values())) for run in runs]
+        for name in runs[0]:
+            words = (f"{run[name]:>{width}}" for run, width in zip(runs, widths, strict=True))
             say(f"  {name:{left}}  {'  '.join(words)}".rstrip())
     say(MARK_MEANS)
     say_wrapped(how_measured(tradeoff))

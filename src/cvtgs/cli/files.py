@@ -357,7 +357,7 @@ def _convert_one(job: SceneJob, edits: SceneEdits) -> Outcome:
             say(f"In {f'{options.suffix} files' if job.to_stream else name}:", file=stream)
         for phrase in lost.changed:
             say_wrapped(phrase, indent=2, file=stream)
-        rest = "nothing but precision" if lost.changed else "nothing"
+        rest = "nothing else" if lost.changed else "nothing"
         say_wrapped(f"Lost: {'; '.join([*phrases, *lost.dropped]) or rest}.", file=stream)
     with warnings.catch_warnings():
         if not options.quiet:  # printed here instead

@@ -80,8 +80,8 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     "--images": {
         "metavar": "DIR",
         "type": Path,
-        "help": "photographs of --cameras, matched by name, to score against as well; images are "
-        "rendered at their size unless --size is given",
+        "help": "photographs of --cameras, matched by name, to score against as well; images have "
+        "their size if it is smaller than that of --cameras, unless --size is given",
     },
     "--split": {"choices": ("train", "test"), "help": "split of --cameras to use"},
     "--views": {

@@ -40,7 +40,9 @@ STAGE = "write pages"
 _PAPER, _INK, _FADED = (250, 250, 249), (28, 28, 30), (110, 110, 115)
 _LONGEST_TILE, _SHEET_WIDTH = 360, 2800
 _GAP, _MARGIN, _SIDE, _HEAD, _FOOT = 8, 28, 260, 44, 84
-_RAMP = 340, 14
+_COLUMN = 90
+"""Smallest width of a column, which its caption needs, and longer side of a reduced image."""
+_RAMP, _APART = (340, 14), 100
 _NAME, _TEXT = 20, 15
 
 MOST_BYTES = 7_500_000
@@ -179,19 +181,21 @@ def _draw_sheet(
     from PIL import Image, ImageDraw, ImageFont  # noqa: PLC0415 (takes time to load)
 
     views, height, width, _ = comparison.full.colors.shape
-    longest = min(_LONGEST_TILE, (_SHEET_WIDTH - _SIDE) / views - _GAP)
+    longest = min(_LONGEST_TILE, max(_COLUMN, (_SHEET_WIDTH - _SIDE) / views - _GAP))
     factor = min(1.0, longest / max(width, height))
     tile = max(1, round(factor * width)), max(1, round(factor * height))
     line = 1.45 * _TEXT
     row_height = max(tile[1] + round(1.6 * _TEXT), round(9.5 * line)) + _GAP
-    lefts = [_MARGIN + _SIDE + view * (max(tile[0], 90) + _GAP) for view in range(views + 1)]
+    column = max(tile[0], _COLUMN)
+    lefts = [_MARGIN + _SIDE + view * (column + _GAP) for view in range(views + 1)]
     bottom = _MARGIN + _HEAD + len(rows) * row_height
-    size = lefts[-1] + _MARGIN, bottom + _MARGIN + legend * _FOOT
+    right = max(lefts[-1], lefts[0] + legend * (2 * _RAMP[0] + _APART))
+    size = right + _MARGIN, bottom + _MARGIN + legend * _FOOT
     sheet = Image.new("RGB", size, _PAPER)
     draw = ImageDraw.Draw(sheet)
     large, small = ImageFont.load_default(_NAME), ImageFont.load_default(_TEXT)
     for left, view in zip(lefts, comparison.views, strict=False):
-        draw.text((left, _MARGIN), _shortened(view, tile[0], small), _FADED, small)
+        draw.text((left, _MARGIN), _shortened(view, column, small), _FADED, small)
     for number, row in enumerate(rows):
         top = _MARGIN + _HEAD + number * row_height
         draw.text((_MARGIN, top), _shortened(row.name, _SIDE - 20, large), _INK, large)
@@ -222,7 +226,7 @@ def _draw_legends(sheet: "Image", left: int, top: int, font: "FreeTypeFont | Ima
             alpha_colors,
         ),
     ):
-        start = left + place * (width + 100)
+        start = left + place * (width + _APART)
         sheet.paste(Image.fromarray(colors(low + (high - low) * steps)), (start, top + 20))
         draw.text((start, top - 4), title, _INK, font)
         for share in (0.0, 0.5, 1.0):

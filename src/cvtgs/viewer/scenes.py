@@ -117,10 +117,13 @@ class SceneViewer:
 
         Returns:
             The mean over the cameras; infinite for the full scene itself.
+
+        Raises:
+            InvalidArgumentError: There is no such scene, or not yet.
         """
         images = [
             render(valid_part(one), cameras).rgb.clamp(0, 1)
-            for one in (self.scenes[name].scene, self._scene)
+            for one in (self._named(name), self._scene)
         ]
         return float(psnr(*images).mean())
 
@@ -135,12 +138,18 @@ class SceneViewer:
             A line with the path and the number of Gaussians.
 
         Raises:
-            CvtgsError: The name is empty, or :func:`cvtgs.save` fails.
+            CvtgsError: The name is empty, there is no such scene, or :func:`cvtgs.save` fails.
         """
         if not os.fspath(path).strip():
             raise OutputError("a file name is needed to save a scene, found none.")
-        save(self.scenes[name].scene, path)
-        return f"{os.fspath(path)}: {len(self.scenes[name].scene):,} Gaussians."
+        scene = self._named(name)
+        save(scene, path)
+        return f"{os.fspath(path)}: {len(scene):,} Gaussians."
+
+    def _named(self, name: str) -> GaussianScene:
+        if name not in self.scenes:
+            raise InvalidArgumentError(f"the scene {name!r} does not exist, or not yet.")
+        return self.scenes[name].scene
 
 
 def _counted(scene: GaussianScene, full: GaussianScene) -> str:

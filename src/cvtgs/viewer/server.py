@@ -2,6 +2,7 @@
 
 import io
 import math
+import re
 import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +18,7 @@ from cvtgs.errors import (
     InvalidArgumentError,
     MissingDependencyError,
     how_to_install,
+    memory_errors,
     reason_of,
 )
 from cvtgs.math.frames import robust_frame
@@ -47,6 +49,11 @@ _ABOVE = 0.85
 
 SLIDER = (-3.5, 0.0, 0.05)
 """Range of the slider in log10 of rho: minimum, maximum, step. It starts lower if need be."""
+
+_MARKUP = re.compile(r"[!-/:-@\[-`{-~]")
+"""The characters that Markdown, which may contain HTML, can give a meaning."""
+
+_ADVICE = "free some, or choose another preset"
 
 _GIVE_UP = 0.5
 """Seconds between checks whether the server was closed."""
@@ -297,7 +304,8 @@ class ViewerServer:
                 is_first = not self._first.is_set()
                 self._first.set()
                 if is_first and not (self._wanted.is_set() or self._closed):
-                    with suppress(CvtgsError):  # the next run reports it
+                    # The next run reports errors.
+                    with suppress(CvtgsError), memory_errors("this", _ADVICE):
                         self._viewer.warm_up(self._preset.value)
 
     def _move(self) -> None:
@@ -340,8 +348,14 @@ class ViewerServer:
     def _try(self, action: Callable[[], str]) -> CvtgsError | None:
         """Run an action, and show its result or its error, which is returned, on the page."""
         try:
-            self._notes.content = printable(action())
+            with memory_errors("this", _ADVICE):
+                self._notes.content = plain(action())
         except CvtgsError as error:
-            self._notes.content = f"**{printable(str(error))}**"
+            self._notes.content = f"**{plain(str(error))}**"
             return error
         return None
+
+
+def plain(text: str) -> str:
+    """Escape a text for Markdown, so that names with markup in them are shown as they are."""
+    return _MARKUP.sub(r"\\\g<0>", printable(text))

@@ -23,7 +23,8 @@
     const ratio = data.reference.count / Math.max(1, scene.count);
     if (Math.abs(ratio - 1) < 0.005) return "As many";
     const [factor, word] = ratio > 1 ? [ratio, "fewer"] : [1 / ratio, "more"];
-    return `${number(factor, factor >= 10 || Number.isInteger(factor) ? 0 : 1)}× ${word}`;
+    const digits = factor >= 10 || Number.isInteger(factor) ? 0 : factor < 1.1 ? 2 : 1;
+    return `${number(factor, digits)}× ${word}`;
   };
   const join = (...parts) => parts.filter(Boolean).join(" · ");
   const clamp = (value, low, high) => Math.min(high, Math.max(low, value));

@@ -12,7 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvtgs.errors import DroppedDataWarning, FileFormatError
+from cvtgs.errors import (
+    DroppedDataWarning,
+    FileFormatError,
+    MissingDependencyError,
+    how_to_install,
+)
 from cvtgs.io.files import open_input
 from cvtgs.io.ply.header import SCALARS, Element, Header, Layout, read_header, row_dtype
 from cvtgs.io.ply.properties import (
@@ -203,8 +208,13 @@ def _mapped_chunks(file: BinaryIO, header: Header) -> Iterator[NDArray[Any]]:
 
 def _parsed_rows(file: BinaryIO, header: Header, *, vertex: Element, path: str) -> NDArray[Any]:
     """Read the vertex rows of any PLY file; ASCII rows and rows with lists are held in memory."""
-    from plyfile import PlyData, PlyElementParseError, PlyParseError  # noqa: PLC0415
-
+    try:
+        from plyfile import PlyData, PlyElementParseError, PlyParseError  # noqa: PLC0415
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"{path}: a PLY that is not plain binary needs the package plyfile; "
+            f"{how_to_install('plyfile')}."
+        ) from error
     needed = header.elements[: header.elements.index(vertex) + 1]
     stream = _CleanStream(file, header, plain_header=_plain_header(header, needed))
     try:
