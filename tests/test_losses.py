@@ -243,3 +243,17 @@ def test_a_weight_of_0_leaves_a_term_out() -> None:
     first, second = torch.rand(1, 12, 13, 3), torch.rand(1, 12, 13, 3)
     loss = image_loss(first, second, ssim_weight=0.0, gradient_weight=0.0)
     assert float(loss) == float(l1_loss(first, second))
+
+
+@pytest.mark.parametrize("loss", [*LOSSES, relative_loss])
+def test_autocast_does_not_change_losses(loss) -> None:
+    """In bfloat16, the variances of SSIM would be differences of rounded means."""
+    target = pair(16, 16)[0].float()
+    prediction = (0.97 * target).requires_grad_()
+    wanted = loss(prediction, target)
+    (slope,) = torch.autograd.grad(wanted, prediction)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = loss(prediction, target)
+    assert found.dtype == torch.float32
+    assert torch.equal(found, wanted)
+    assert torch.equal(torch.autograd.grad(found, prediction)[0], slope)

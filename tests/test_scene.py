@@ -91,6 +91,8 @@ def test_scenes_are_indexed_like_tensors():
         scene[-2]
     with pytest.raises(InvalidArgumentError, match=r"or row numbers, found 'label'\.$"):
         scene["label"]
+    with pytest.raises(InvalidArgumentError, match=r"or row numbers, found 0\.5\.$"):
+        scene[0.5]
     with pytest.raises(InvalidArgumentError, match=r"row numbers, found .{57}\.\.\.\.$"):
         scene[[0.5] * 1000]
     with pytest.raises(InvalidArgumentError, match="for each of 9 Gaussians, found 8"):

@@ -76,3 +76,15 @@ def test_every_command_but_completion_loads_torch_this_way(words, wanted):
         [sys.executable, "-c", code, *words], capture_output=True, check=False, text=True
     )
     assert done.stderr == wanted
+
+
+@pytest.mark.slow
+def test_a_program_that_disabled_collections_stays_without_them():
+    code = "import gc; gc.disable(); from cvtgs.startup import load_torch; load_torch()"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}; print(gc.isenabled())"],
+        capture_output=True,
+        check=True,
+        text=True,
+    )
+    assert done.stdout == "False\n"

@@ -20,7 +20,7 @@ _COUNT = re.compile(r"\s*(\d{1,3}(?:,\d{3})+|\d[\d_]*(?:\.\d+)?(?:e\+?\d\d?)?)\s
 def read_ratio(text: str) -> float:
     """Parse a ratio such as ``0.05`` or ``5%``, which may be out of range."""
     match = re.fullmatch(
-        r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d{1,6})?|nan|inf)\s*(%?)\s*", text, re.I
+        r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d{1,5})?|nan|inf)\s*(%?)\s*", text, re.I
     )
     if not match:
         raise InvalidArgumentError(f"a ratio must be a number such as 0.05 or 5%, found {text!r}.")

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.devices import without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import positive_log
 
@@ -74,6 +75,7 @@ def ssim_loss(
     return 1 - mean_ssim(prediction, target).mean()
 
 
+@without_autocast()  # variances are small differences of large means
 def mean_ssim(
     prediction: Float[Tensor, "c h w 3"], target: Float[Tensor, "c h w 3"]
 ) -> Float[Tensor, "c"]:

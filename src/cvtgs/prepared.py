@@ -249,9 +249,10 @@ class Prepared:
         if self._checked is None:
             with clock.stage("check"):
                 used = select_columns(self._scene, self._config.effects).to(self._device)
-                # sums over rows would round another way
-                tensors = {name: tensor.contiguous() for name, tensor in used.tensors().items()}
-                used = used.with_tensors(tensors)
+                # Gradients end here, and sums over other than whole rows would round another way.
+                tensors = {name: x.detach().contiguous() for name, x in used.tensors().items()}
+                extras = {name: column.detach() for name, column in used.extras.items()}
+                used = used.with_tensors(tensors, extras)
                 if self._checkpoint is not None:
                     self._net = self._checkpoint.net.copy_to(self._device, used.means.dtype)
                 self._checked = check_rows(used)

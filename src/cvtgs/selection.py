@@ -43,13 +43,15 @@ def row_numbers(
         picked = torch.as_tensor(rows, device=device)
     except (TypeError, ValueError, RuntimeError):
         raise _error(rows, things) from None
+    if picked.ndim != 1 and picked.numel():  # such as a single number
+        raise _error(rows, things)
     if picked.dtype == torch.bool:
         if len(picked) != count:
             raise InvalidArgumentError(
                 f"a mask must have an entry for each of {count:,} {things}, found {len(picked):,}."
             )
         return picked.nonzero()[:, 0]
-    if len(picked) and (picked.is_floating_point() or picked.is_complex() or picked.ndim != 1):
+    if len(picked) and (picked.is_floating_point() or picked.is_complex()):
         raise _error(rows, things)
     if picked.dtype not in (torch.int32, torch.int64):
         picked = picked.to(torch.int64)

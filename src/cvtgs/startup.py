@@ -25,9 +25,11 @@ def load_torch() -> None:
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
         os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    was_enabled = gc.isenabled()
     gc.disable()
     try:
         import torch  # noqa: F401, PLC0415 (the settings come first)
     finally:
-        gc.enable()
+        if was_enabled:
+            gc.enable()
     gc.freeze()

@@ -129,6 +129,22 @@ def test_equal_groups_cost_nothing_and_overflowing_ones_merge_last():
     assert labels.tolist() == [0, 1, 1, 2]
 
 
+@pytest.mark.parametrize("size", [1e15, 1e40, 1e70])
+def test_a_giant_changes_no_costs_of_others(size):
+    """Beside a mean of 1e68, the masses of all others would be 0 in float32, and pairs free."""
+    scene, factors = random_scene(300), torch.ones(300).double()
+    near = cvt.nearest_neighbors(scene.means[1:], 12)
+
+    def labels_of_others():
+        masses, frame = factors * scene.masses, analyze(scene, SimplifyConfig()).frame
+        moments = gaussian_moments(scene, torch.arange(300), frame, weights=masses, masses=masses)
+        return merge_pairs(Moments(*(values[..., 1:] for values in moments)), near, 60, DEFAULT)
+
+    alone = labels_of_others()
+    factors[0] = size
+    assert torch.equal(labels_of_others(), alone)
+
+
 def test_pairs_that_merged_cost_as_much_as_the_moments_of_their_members():
     """Moments of groups are kept up to date from round to round, in float32."""
     members = scene_moments(random_scene(300))

@@ -225,6 +225,13 @@ def test_coincident_neighbours_do_no_harm():
     assert bool(settled(scene).quats.isfinite().all())
 
 
+def test_coincident_neighbours_do_not_pull():
+    scene = cells_of(SHAPES["balls"]).select(torch.arange(3))
+    means = torch.tensor([[0.0, 0, 0], [0, 0, 0], [3, 4, 0]]).double()
+    axes = axes_of(settled(scene.with_tensors({"means": means}, {})))[0]
+    assert axes[:, 0].abs().tolist() == pytest.approx([0.6, 0.8, 0.0], abs=1e-9)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["32", "64"])
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 def test_aligning_axes_keeps_covariances(shape, dtype):

@@ -108,6 +108,8 @@ def test_scenes_far_from_the_origin_are_warned_about(tmp_path, capsys):
     match = r"resolves steps of 0\.5: precision is already lost"
     with pytest.warns(UserWarning, match=match) as caught:
         cvtgs.validity.warn_of_lost_digits(scene)
+    with pytest.warns(UserWarning, match=match):
+        cvtgs.validity.warn_of_lost_digits(moved((0.0, -5_400_000.0, 0.0)))
     assert "shifted by -500000,-5400000," in str(caught[0].message).replace("-5399999", "-5400000")
     cvtgs.save(scene, tmp_path / "a.ply")
     assert main(["info", str(tmp_path / "a.ply")]) == 0

@@ -365,3 +365,9 @@ def test_the_command_cuts_the_scene_if_memory_is_low(source, tmp_path, capsys, m
     assert "In 8 blocks." in capsys.readouterr().out
     assert main([*words, "--memory", "2MB", "--refine", "3"]) == 1
     assert main([*words, "--memory", "2MB", "--time-budget", "20s"]) == 1
+
+
+def test_the_number_of_blocks_may_be_one_of_numpy(tmp_path):
+    random_scene(300).save(tmp_path / "scene.ply")
+    report = simplify_file(tmp_path / "scene.ply", tmp_path / "a.ply", 0.1, blocks=np.int64(2))
+    assert report.blocks == 2

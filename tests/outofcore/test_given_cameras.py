@@ -1,6 +1,7 @@
 """Given cameras in blocks: contributions, matching and refinement use them, as in one piece."""
 
 import json
+import math
 from dataclasses import replace
 
 import pytest
@@ -11,12 +12,14 @@ from block_jobs import unfinished_job
 from camera_files import transforms, write_json
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.analysis import visibility_cameras
+from cvtgs.cameras import Cameras
 from cvtgs.cli.main import main
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.outofcore import LocalWorkers, improve, simplify_file
 from cvtgs.outofcore.improve import cameras_of_block
 from cvtgs.rendering import contributions, render
 from refine_cases import ring
+from scenes import random_scene
 
 BLOCKS = 2
 MATCHED = {
@@ -101,6 +104,25 @@ def test_a_block_takes_the_cameras_that_show_it(scene):
     found = cameras_of_block(joined, scene)
     assert torch.equal(found.viewmats, at_it.viewmats)
     assert len(cameras_of_block(at_it, beside)) == 0
+
+
+@pytest.mark.parametrize(("pixels", "count"), [(10.5, 2), (9.5, 1)])
+def test_one_gaussian_counts_for_at_most_a_hundredth_of_an_image(pixels, count):
+    """Of 10,000 pixels, the first camera sees one Gaussian; the second sees another of a tenth."""
+    cameras = Cameras(
+        viewmats=torch.stack([torch.eye(4), torch.diag(torch.tensor([-1.0, 1, -1, 1]))]),
+        Ks=torch.tensor([[100.0, 0, 100], [0, 100, 25], [0, 0, 1]]).repeat(2, 1, 1),
+        width=200,
+        height=50,
+    )
+    scene = random_scene(2, degree=0)
+    widths = torch.tensor([1.0, math.sqrt(pixels / math.pi) / 50])
+    tensors = {
+        "means": torch.tensor([[0.0, 0, 2], [0, 0, -2]]),
+        "log_scales": widths.log()[:, None].repeat(1, 3),
+        "logit_opacities": torch.zeros(2),
+    }
+    assert len(cameras_of_block(cameras, scene.with_tensors(tensors, {}))) == count
 
 
 @pytest.fixture

@@ -208,6 +208,7 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
         scenes.append(rows.scene)
         areas.append(rows.apparent_areas)
     scene, labels = concatenate(scenes), torch.cat(labels)
+    assert job.read_scan().view_components.shape[1] > 0
     members = cells.gaussian_moments(
         scene,
         torch.arange(len(scene)),

@@ -5,16 +5,23 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 import torch
 
 import cvtgs
+from cvtgs import SimplifyConfig
+from cvtgs.boxes import Box
 from cvtgs.errors import InvalidSceneError, OutputError
+from cvtgs.io.ply import open_rows
 from cvtgs.io.tensors import save_tensors
+from cvtgs.mergenet import load_checkpoint
 from cvtgs.outofcore import simplify_file
+from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.sort import Attempt
 from cvtgs.streams import stream_file
+from refine_cases import ring
 
 CODE = """
 import sys
@@ -139,6 +146,51 @@ def test_blocks_of_another_job_are_not_used(source, tmp_path, change):
     assert report.resumed_blocks == 0
     assert len(cvtgs.load(output)) == cvtgs.target_count(20_000, rho)
     assert not folder.exists()
+
+
+def test_everything_that_a_result_depends_on_changes_the_key_of_a_job(tmp_path, monkeypatch):
+    path, scene = tmp_path / "in.ply", cvtgs.synthetic.scene("object", 50, sh_degree=1)
+    cvtgs.save(replace(scene, comments=("first",)), path)
+    changed_at = path.stat().st_mtime_ns
+    job = Job(
+        folder="",
+        source=open_rows(path),
+        target=9,
+        blocks=2,
+        boxes=(),
+        config=SimplifyConfig(),
+        has_network=True,
+        range_rows=100,
+    )
+    cameras = ring(2)
+    others = [
+        {"source": open_rows(path, sh_degree=0)},
+        {"source": open_rows(path, axes="lub")},
+        {"target": 8},
+        {"blocks": 3},
+        {"boxes": (Box(min=(0, 0, 0), max=(1, 1, 1)),)},
+        {"boxes": (Box(min=(0, 0, 0), max=(1, 1, 2)),)},
+        {"config": SimplifyConfig.from_preset("draft")},
+        {"range_rows": 99},
+        {"sample_rows": 98},
+        {"cell_room": 97},
+        {"axes": "lub"},
+        {"cameras": cameras},
+        {"cameras": replace(cameras, Ks=2 * cameras.Ks)},
+        {"cameras": replace(cameras, strides=(1, 2))},
+        {"cameras": replace(cameras, ignores_tag=(False, True))},
+    ]
+    keys = {replace(job, **other).key(None) for other in others}
+    keys |= {job.key(None), job.key(load_checkpoint("standard")), job.key(load_checkpoint("paper"))}
+    assert replace(job, folder="elsewhere").key(None) in keys
+    cvtgs.save(replace(scene, comments=("other",)), path, overwrite=True)
+    os.utime(path, ns=(changed_at, changed_at))
+    keys.add(job.key(None))
+    os.utime(path, ns=(0, 0))
+    keys.add(job.key(None))
+    monkeypatch.setattr(cvtgs, "__version__", "0")
+    keys.add(job.key(None))
+    assert len(keys) == len(others) + 6
 
 
 @pytest.mark.long

@@ -3,11 +3,13 @@
 import math
 from importlib import import_module
 
+import numpy as np
 import pytest
 import torch
 
 import cvtgs
 from cvtgs.config import Rates
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import LOGIT_LIMIT
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.refinement import refine
@@ -221,3 +223,19 @@ def test_huge_gaussians_have_finite_units(log_scale):
         learning_rate_scale=torch.ones(len(scene)),
     )
     assert all(tensor.isfinite().all() for tensor in optimizer.scene().tensors().values())
+
+
+def test_seeds_are_whole_numbers_of_any_type():
+    full = full_scene()
+    small = discolored(full)
+    options = {"steps": 2, "config": quick()}
+    wanted = refine(small, full, seed=3, **options).scene
+    assert same_bits(refine(small, full, seed=np.int64(3), **options).scene, wanted)
+    for seed in (None, 0.5, "0"):
+        with pytest.raises(
+            InvalidArgumentError, match=f"seed must be a whole number, found {seed!r}"
+        ):
+            refine(small, full, seed=seed, **options)
+    for frozen in (None, 0.5, -1):
+        with pytest.raises(InvalidArgumentError, match=f"frozen must be from 0 .* found {frozen}"):
+            refine(small, full, frozen=frozen, **options)

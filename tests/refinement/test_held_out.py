@@ -22,6 +22,22 @@ def test_the_middles_of_equal_parts_are_held_out():
         assert torch.equal(held.viewmats[0], cameras.viewmats[row])
 
 
+def test_held_out_views_and_every_batch_have_seeds_of_their_own(monkeypatch):
+    seeds = []
+
+    def views(_positions, count, *, size, seed):
+        seeds.append(seed)
+        return ring(count, width=size, height=size)
+
+    monkeypatch.setattr("cvtgs.refinement.images.find_view_positions", lambda full: None)
+    monkeypatch.setattr("cvtgs.refinement.images.mixed_views", views)
+    found = generated_views(full_scene(), config=RefineConfig(size=32, heldout=2, batch=4), seed=5)
+    for _ in range(9):
+        next(found.training)
+    assert len(set(seeds)) == 4
+    assert 5 not in seeds  # evaluations use it
+
+
 def test_thinned_views_start_at_every_first_pixel_in_turn():
     held = split_views(ring(40), config=RefineConfig(size=32, stride=2), seed=0).heldout
     shifts = [tuple((one.Ks - held[0].Ks)[0, :2, 2].tolist()) for one in held]

@@ -15,6 +15,7 @@ from cvtgs.errors import (
     InputNotFoundError,
     InvalidArgumentError,
 )
+from cvtgs.prepared import check_cameras
 from cvtgs.refinement import RefineConfig
 from cvtgs.rendering import contributions
 from scenes import random_scene, same_bits
@@ -107,6 +108,14 @@ def test_too_few_cameras_are_refused_before_the_work(preset, count):
     with pytest.raises(InvalidArgumentError, match=f"at least 2 cameras, .*; found {count}"):
         Simplifier(config=preset, device="cpu").prepare(scene, cameras=cameras)
     assert len(Simplifier(device="cpu").simplify(scene, 0.1, cameras=cameras)) == 3
+
+
+def test_one_camera_is_enough_without_a_refinement():
+    cameras = cvtgs.views.automatic_views(random_scene(30), 1, width=32, height=24)
+    matched = SimplifyConfig.from_mapping({"preset": "matched", "refine": {"steps": 0}})
+    check_cameras(cameras, matched)
+    with pytest.raises(InvalidArgumentError, match="at least 1 camera; found 0"):
+        check_cameras(cameras.select(torch.arange(0)), matched)
 
 
 def test_the_report_names_no_views_where_nothing_is_rendered():

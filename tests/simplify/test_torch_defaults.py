@@ -119,10 +119,11 @@ def streamed(scene, folder):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("setting", [another_device, autocast])
 @pytest.mark.parametrize("work", [in_blocks, streamed])
-def test_files_in_parts(scene, tmp_path, work):
+def test_files_in_parts(scene, tmp_path, work, setting):
     wanted = list(work(scene, tmp_path))
-    with another_device():
+    with setting():
         found = list(work(scene, tmp_path))
     assert len(found) > 1
     assert all(same_bits(one, other) for one, other in zip(found, wanted, strict=True))
@@ -169,3 +170,17 @@ def test_scenes_that_require_gradients(scene, work):
     found = work(scene.with_tensors(leaves, {}))
     assert all(same_bits(one, other) for one, other in zip(found, work(scene), strict=True))
     assert not any(values.requires_grad for values in found[0].tensors().values())
+
+
+def test_no_result_requires_gradients(scene):
+    """Where all Gaussians are kept, they are in the memory of the scene, but as plain tensors."""
+    leaves = {name: values.clone().requires_grad_() for name, values in scene.tensors().items()}
+    heat = torch.rand(len(scene), requires_grad=True)
+    trained = scene.with_tensors(leaves, {"heat": heat})
+    simplifier = Simplifier(device="cpu")
+    whole, small = (level.scene for level in simplifier.levels(trained, [1.0, 0.1]))
+    for found in (whole, small, simplifier.simplify(trained, max_count=10**6)):
+        tensors = [*found.tensors().values(), *found.extras.values()]
+        assert not any(values.requires_grad for values in tensors)
+    assert whole.means.data_ptr() == trained.means.data_ptr()
+    assert torch.equal(whole.means, scene.means)

@@ -2,11 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 import cvtgs
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import psnr
 from cvtgs.math import parameters
 from cvtgs.rendering import render
@@ -279,3 +281,19 @@ def test_scenes_that_require_gradients_and_any_seeds():
         automatic_views(scene, 2, width=32, height=32, seed=seed).viewmats for seed in (-1, -2)
     ]
     assert not torch.equal(*minus)
+
+
+def test_numbers_of_numpy_are_accepted():
+    scene = random_scene(50)
+    count, seed = np.int64(8), np.int64(2)
+    found = automatic_views(scene, count, width=32, height=24, seed=seed)
+    wanted = automatic_views(scene, 8, width=32, height=24, seed=2)
+    assert torch.equal(found.viewmats, wanted.viewmats)
+    found = mixed_views(scene, count, size=32, seed=seed)
+    assert torch.equal(found.viewmats, mixed_views(scene, 8, size=32, seed=2).viewmats)
+
+
+@pytest.mark.parametrize("count", [-1, 1.5, None, True])
+def test_random_views_need_a_whole_number_of_views(count):
+    with pytest.raises(InvalidArgumentError, match=f"at least 0; found {count}"):
+        random_views(random_scene(50), count, size=32, seed=0)

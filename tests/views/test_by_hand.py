@@ -115,6 +115,12 @@ def test_only_far_content_of_two_percent_shows_the_sky():
     assert len(directions(places[2:], places[2:].norm(dim=1))) == 0
 
 
+def test_a_voxel_is_among_others_if_two_are_within_two_steps():
+    near = torch.tensor([[1.05, 1.05, 1.05], [1.25, 1.05, 1.05], [1.05, 1.25, 0.85]]).double()
+    alone = torch.tensor([[-2.05, 0.05, 0.05], [2.95, 2.95, 2.95], [2.75, 2.95, 2.95]]).double()
+    assert up.among_others(torch.cat([near, alone])).tolist() == [True] * 3 + [False] * 3
+
+
 def test_sizes_that_shrink_upwards_show_what_is_up():
     """Parts that no image shows, mostly undersides, have larger Gaussians."""
     g = torch.Generator().manual_seed(0)

@@ -89,6 +89,13 @@ def test_no_position_is_nearer_to_a_cluttered_one_than_to_a_clear_one():
     assert positions.admit(eyes).tolist() == [True, True, False, False]
     free = replace(positions, cluttered=positions.cluttered[:0])
     assert free.admit(eyes).tolist() == [True, True, True, True]
+    both = replace(
+        positions,
+        eyes=radius * torch.tensor([[0.0, 0.0, -0.5]]).double(),
+        cluttered=radius * torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 9.0]]).double(),
+    )
+    eyes = radius * torch.tensor([[0.0, 0.0, -0.4], [0.0, 0.0, 0.4]]).double()
+    assert both.admit(eyes).tolist() == [True, False]
 
 
 def test_views_are_at_clear_positions(monkeypatch):

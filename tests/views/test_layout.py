@@ -42,6 +42,14 @@ def layout_of(**changes) -> SceneLayout:
     return replace(layout.find_layout(random_scene(20)), **plain | changes)
 
 
+def test_a_layout_is_found_from_valid_rows_only():
+    scene = random_scene(20)
+    means = scene.means.clone()
+    means[3] = math.nan
+    part = layout.viewable_part(scene.with_tensors({"means": means}))
+    assert torch.equal(part.means, torch.cat([means[:3], means[4:]]))
+
+
 def test_surfaces_beneath_do_not_enclose():
     directions, eye = sphere(), torch.zeros(3).double()
     assert layout.enclosure(eye, directions[directions @ UP < 0], UP) == 0.0
@@ -68,12 +76,20 @@ def test_only_what_is_hidden_from_above_and_below_is_inside_matter(least_height,
     assert positions.stand_free(layout_of(voxels=voxels_at(points)), eye).tolist() == [is_free]
 
 
+def test_positions_near_a_surface_are_not_free_in_units_of_the_radius():
+    frame = RobustFrame(center=torch.ones(3).double(), radius=2.0)
+    eyes = 1.0 + torch.tensor([[1.8, 0, 0], [1.6, 0, 0], [2.2, 0, 0], [2.4, 0, 0]]).double()
+    place = layout_of(frame=frame, voxels=voxels_at(sphere()[:1000]))
+    assert positions.stand_free(place, eyes).tolist() == [False, True, False, True]
+
+
 def test_sides_seen_from_below_are_not_sharp(monkeypatch):
     def smallest(_, cameras) -> SplatSizes:
         return SplatSizes(*torch.zeros(3, len(cameras)))
 
     monkeypatch.setattr(positions, "splat_sizes", smallest)
     directions = vars(positions)["_side_directions"]()
+    assert float((sphere() @ directions.T).amax(dim=1).amin()) > 0.85  # they are evenly spread
     sharp = vars(positions)["_sharp_sides"](layout_of(), 2 * directions)
     assert sharp.tolist() == (directions @ UP >= 0).tolist()
     assert int(sharp.sum()) == 16

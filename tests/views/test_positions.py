@@ -186,6 +186,15 @@ def test_the_finest_splats_are_the_lower_decile_of_what_is_seen(small, finest):
     assert sizes.in_scene.tolist() == pytest.approx([0.1 / 2.0])
 
 
+def test_an_image_that_shows_nothing_counts_all_splats():
+    """The camera looks along +z from -2, and everything is behind it."""
+    means = torch.tensor([[0.0, 0, -5], [0.1, 0, -5], [0, 0.1, -5]])
+    widths = torch.tensor([0.1, 0.2, 0.3]).double()
+    camera = from_two_away(focal=50.0, side=32)
+    sizes = measure_splats(blobs(means, widths.float().log()), widths, 2.0, camera)
+    assert bool(torch.stack(sizes).isfinite().all())
+
+
 def test_every_fourth_gaussian_shows_nearly_the_same_sizes(monkeypatch):
     scene = cvtgs.synthetic.scene("object", 24_000, sh_degree=0, seed=1)
     layout, cameras = find_layout(scene), automatic_views(scene, 6, width=64, height=64)
@@ -289,13 +298,14 @@ def test_the_share_hidden_behind_walls_by_hand() -> None:
     assert math.isclose(hidden_share(eye, torch.cat([ring, 1.8 * ring])), 0.5)
 
 
-def test_cameras_in_a_room_stand_back_by_a_share_of_the_way_to_the_wall_behind() -> None:
-    """Walls are 0.5 from the eye on one side, 1.4 on the other, and 1 between."""
+@pytest.mark.parametrize("radius", [1.0, 2.0])
+def test_cameras_in_a_room_stand_back_by_a_share_of_the_way_to_the_wall_behind(radius) -> None:
+    """Walls are 0.5 radii from the eye on one side, 1.4 on the other, and 1 between."""
     right, up = torch.tensor([1.0, 0, 0]).double(), torch.tensor([0.0, 0, 1]).double()
     walls = torch.tensor([[1.4, 0, 0], [-0.5, 0, 0], [0, 1, 0], [0, -1, 0]]).double()
     layout = replace(
         find_layout(blobs(sphere(100), torch.full((100,), -3.0))),
-        frame=RobustFrame(center=torch.zeros(3).double(), radius=1.0),
+        frame=RobustFrame(center=torch.zeros(3).double(), radius=radius),
         voxels=Voxels(points=walls, normals=walls, log_sizes=walls[:, 0]),
         up=up,
     )
@@ -304,5 +314,6 @@ def test_cameras_in_a_room_stand_back_by_a_share_of_the_way_to_the_wall_behind()
     ahead = cameras.viewmats[:, 2, :3].double() @ right
     for side, wall in ((1.0, 0.5), (-1.0, 1.4)):
         (row,) = (side * ahead > 0.9).nonzero()[:, 0].tolist()
-        assert cameras.centers[row].tolist() == pytest.approx([-0.65 * wall * side, 0, 0], abs=1e-6)
-        assert float(found.distances[0][row]) == pytest.approx(0.65 * wall + 0.5)
+        back = 0.65 * wall * radius
+        assert cameras.centers[row].tolist() == pytest.approx([-back * side, 0, 0], abs=1e-6)
+        assert float(found.distances[0][row]) == pytest.approx(back + 0.5 * radius)

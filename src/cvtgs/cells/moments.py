@@ -31,6 +31,12 @@ LEAST_SPREAD = 0.01
 LEAST_SHARE = 0.1
 """Smallest share of the variance of a component that neighbours have in common; less is chance."""
 
+MOST_MEDIANS = 1e6
+"""Largest unit of masses, in medians: a few giants must not make all others 0 in float32."""
+
+LARGEST_MASS = 1e30
+"""Limit of weights and masses, in this unit, so that sums are finite in float32."""
+
 SAMPLED_PAIRS = 1 << 14
 """Approximate number of pairs of neighbours in which components are sought."""
 
@@ -41,7 +47,7 @@ class Moments(NamedTuple):
     Attributes:
         counts: ``(n,)`` number of Gaussians.
         weights: ``(n,)`` weights in the moments of a group: the masses.
-        masses: ``(n,)`` masses as seen in images, mean 1 over all Gaussians.
+        masses: ``(n,)`` masses as seen in images, mean 1 over all Gaussians but for giants.
         means: ``(3, n)`` positions, robust radii from the centre of the scene.
         covariances: ``(6, n)`` upper triangles, squared robust radii.
         colors: ``(3, n)`` RGB of the constant band.
@@ -76,7 +82,7 @@ def gaussian_moments(
         weights: Mass of each.
         masses: Mass of each as seen in images.
         components: Result of :func:`view_components`; None for no view-dependent colour.
-        unit: Divisor of weights and masses; None divides each by its own mean.
+        unit: Divisor of weights and masses; None divides each by its own :func:`mass_unit`.
 
     Returns:
         The moments, in the order of the rows.
@@ -105,17 +111,38 @@ def gaussian_moments(
     tiny = torch.finfo(torch.float64).tiny
     weights, masses = weights.double(), masses.double()
     units = [
-        values.mean() if unit is None else values.new_tensor(unit) for values in (weights, masses)
+        mass_unit(values, values.mean()) if unit is None else values.new_tensor(unit)
+        for values in (weights, masses)
     ]
     return Moments(
         counts=torch.ones_like(weights),
-        weights=(weights / units[0].clamp_min(tiny)).clamp_min(1e-12),
-        masses=masses / units[1].clamp_min(tiny),
+        weights=(weights / units[0].clamp_min(tiny)).clamp(1e-12, LARGEST_MASS),
+        masses=(masses / units[1].clamp_min(tiny)).clamp_max(LARGEST_MASS),
         means=means,
         covariances=covariances,
         colors=colors,
         view_colors=varying,
     )
+
+
+def mass_unit(masses: Float[Tensor, "n"], mean: Tensor | float) -> Float[Tensor, ""]:
+    """Return the unit of masses: their mean, unless a few giants make it useless.
+
+    Args:
+        masses: Masses of all Gaussians, or of a sample.
+        mean: Mean mass of all Gaussians.
+
+    Returns:
+        The mean, but at most a million medians; float64.
+
+    Example:
+        >>> float(mass_unit(torch.tensor([1.0, 1.0, 7.0]), 3.0))
+        3.0
+        >>> float(mass_unit(torch.ones(3), 1e60))
+        1000000.0
+    """
+    most = MOST_MEDIANS * masses.double().median()
+    return torch.where(most > 0.0, most, torch.inf).clamp_max(mean)
 
 
 def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Moments:

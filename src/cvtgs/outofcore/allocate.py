@@ -54,7 +54,7 @@ def _members(job: Job, rows: BlockRows, components: Tensor | None = None) -> Mom
         weights=scene.masses,
         masses=rows.apparent_areas * scene.opacities,
         components=components,
-        unit=scan.mass / (scan.row_count + scan.kept_count),
+        unit=scan.mass_unit,
     )
 
 

@@ -15,7 +15,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, shortfall, target_count
-from cvtgs.devices import HOST, on_host, one_thread
+from cvtgs.devices import HOST, on_host, one_thread, without_autocast
 from cvtgs.errors import ConfigError, DroppedDataWarning
 from cvtgs.evaluation.scorer import check_seen
 from cvtgs.grouping import finer_count
@@ -159,7 +159,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         folder="",
         source=rows,
         target=target,
-        blocks=max(1, min(wanted, target)),
+        blocks=max(1, min(int(wanted), target)),
         boxes=tuple(boxes),
         config=simplifier.config,
         has_network=simplifier.checkpoint is not None,
@@ -172,7 +172,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     key = job.key(simplifier.checkpoint)
     job = replace(job, folder=job_folder(output, key))
     clock = StageClock(listener, HOST)
-    with output_lock(output):
+    with output_lock(output), without_autocast():
         resumes = job.can_resume(key)
         with started(job, workers, clock, simplifier.checkpoint, resumes=resumes):
             if not resumes:

@@ -59,10 +59,7 @@ def partition_space(
     points: Float[Tensor, "n 3"], measure: Float[Tensor, "n"], count: int
 ) -> KdPartition:
     """Split space into blocks of equal measure, each time along the axis of largest variance."""
-    axes: list[int] = []
-    thresholds: list[float] = []
-    children: list[list[int]] = []
-    leaves = 0
+    axes, thresholds, children, leaves = list[int](), list[float](), list[list[int]](), 0
 
     def split(rows: Tensor, blocks: int) -> int:
         nonlocal leaves
@@ -187,6 +184,7 @@ class SceneScan:
         view_components: Components of the view-dependent colour
             (:func:`cvtgs.cells.view_components`).
         mass: Opacity times mean projected area of all valid Gaussians, squared scene units.
+        mass_unit: Unit of the masses in moments (:func:`cvtgs.cells.moments.mass_unit`).
         invalid_rows: Rows that are dropped, by the attribute that is NaN, infinite or zero.
         row_count: Number of valid Gaussians outside boxes.
         kept_count: Number of valid Gaussians in boxes.
@@ -204,6 +202,7 @@ class SceneScan:
     partition: KdPartition
     view_components: Float[Tensor, "c k"]
     mass: float
+    mass_unit: float
     invalid_rows: dict[str, int]
     row_count: int
     kept_count: int
@@ -297,7 +296,7 @@ def scan_scene(
     if boxes and len(free):
         sample, known = sample.select(free), known.select(free)
     row_count = totals.valid_count - totals.kept_count
-    rows_per_sample = row_count / max(1, len(sample))
+    rows_per_sample, mean_mass = row_count / max(1, len(sample)), totals.mass / totals.valid_count
     least = min(len(sample), -int(-target // rows_per_sample))
     no_flyaways = config.filter.model_copy(update={"max_flyaway_share": 0.0})
     rows = filters.filter_rows(sample, known, least, no_flyaways).rows
@@ -322,6 +321,7 @@ def scan_scene(
         partition=partition_space(frame.contract(sample.means[rows]), measure, blocks),
         view_components=_view_components(sample, known, rows, config),
         mass=totals.mass,
+        mass_unit=float(cells.moments.mass_unit(known.areas * known.opacities, mean_mass)),
         invalid_rows=totals.invalid_rows,
         row_count=row_count,
         kept_count=totals.kept_count,

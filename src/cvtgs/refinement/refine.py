@@ -7,6 +7,7 @@ import torch
 from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import RefineConfig
+from cvtgs.counts import whole_number
 from cvtgs.devices import chosen_device, without_autocast
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer, check_seen
@@ -19,6 +20,7 @@ from cvtgs.report import RefineReport, SimplifyReport
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.text import shown
 from cvtgs.validity import valid_rows
+from cvtgs.views.positions import checked_seed
 
 DEFAULT_STEPS = 500
 """Number of steps if neither seconds nor steps are given."""
@@ -86,7 +88,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
 
     Raises:
         InvalidArgumentError: Seconds or steps are not positive, there is only one camera, no
-            camera sees the full scene, or ``frozen`` is out of range.
+            camera sees the full scene, ``frozen`` is out of range, or the seed is no whole number.
         InvalidSceneError: A scene has no valid row.
         DeviceError: There is no such device.
 
@@ -105,10 +107,13 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         seconds = config.seconds or None
         steps = config.steps or (DEFAULT_STEPS if seconds is None else None)
     check_limits(seconds, steps=steps)
-    if not 0 <= frozen <= len(small):
+    if not 0 <= whole_number(frozen) <= len(small):
         raise InvalidArgumentError(
-            f"frozen must be from 0 to {len(small)}, the number of Gaussians; found {frozen}."
+            f"frozen must be from 0 to {len(small)}, the number of Gaussians; "
+            f"found {shown(frozen)}."
         )
+    checked_seed(seed)
+    seed = int(seed)  # also one of numpy
     place = chosen_device(device, small.device)
     ours, theirs = _on_device(small, full, place)
     if cameras is not None:

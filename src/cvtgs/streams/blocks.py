@@ -18,7 +18,7 @@ from cvtgs.analysis import SceneAnalysis, select_columns
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, target_count
-from cvtgs.devices import HOST, on_host, one_thread
+from cvtgs.devices import HOST, on_host, one_thread, without_autocast
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
 from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output, change_axes
@@ -224,7 +224,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
         folder="",
         source=rows,
         target=merged[0],
-        blocks=max(1, min(wanted, targets[-1])),
+        blocks=max(1, min(int(wanted), targets[-1])),
         boxes=(),
         config=simplifier.config,
         has_network=simplifier.checkpoint is not None,
@@ -245,7 +245,8 @@ def stream_file(  # noqa: PLR0913 (options by name)
     key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
     spec = replace(spec, job=replace(job, folder=job_folder(folder, key)))
     check_stream(folder, kind, overwrite=overwrite)
-    with output_lock(Path(spec.job.folder).parent):  # commands lock the output folder
+    lock = output_lock(Path(spec.job.folder).parent)  # commands lock the output folder
+    with lock, without_autocast():
         parts, resumed = _run(spec, targets, simplifier, workers, StageClock(listener, HOST))
         write_index(form, parts, spec.folder)
         warn_of_losses(parts, Path(folder), stacklevel=4)

@@ -142,7 +142,7 @@ def found_candidates(
     cameras = cameras_at(
         eyes, directions, layout.up, size=size, field=INSIDE_FIELD if inside else OUTSIDE_FIELD
     )
-    rows = torch.arange(len(eyes), device="cpu").split(count)
+    rows = torch.arange(len(eyes), device="cpu").split(int(count))  # torch takes no numpy.int64
     distances = torch.linalg.vector_norm(directions, dim=1)
     return CandidateCameras(
         inside=inside,

@@ -8,7 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras, look_at
+from cvtgs.counts import whole_number
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.scene import SceneLike
+from cvtgs.text import shown
 from cvtgs.views.automatic import automatic_views
 from cvtgs.views.positions import CameraPositions, as_positions, checked_seed
 from cvtgs.views.scoring import SMOOTH, splat_sizes
@@ -62,7 +65,8 @@ def random_views(
         with 65 degrees.
 
     Raises:
-        InvalidArgumentError: The size is no whole number above 0, or the seed is no whole number.
+        InvalidArgumentError: The count or the seed is no whole number, the count is negative, or
+            the size is no whole number above 0.
         InvalidSceneError: The scene has no valid row, or is larger than 1e14 units.
 
     Example:
@@ -71,6 +75,10 @@ def random_views(
         3
     """
     seed = checked_seed(seed, size=size)
+    if whole_number(count) < 0:
+        raise InvalidArgumentError(
+            f"count must be a whole number, at least 0; found {shown(count)}."
+        )
     positions = as_positions(scene)
     layout = positions.layout
     eyes = positions.near(count, reach, seed)
