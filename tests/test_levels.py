@@ -1,4 +1,4 @@
-"""Several sizes of one scene: exact counts, the finest as in a single run, nested cells, files."""
+"""Several sizes of one scene: exact counts, the same as single runs, files."""
 
 import json
 
@@ -9,12 +9,9 @@ import cvtgs
 from cvtgs import Simplifier
 from cvtgs.analysis import analyze
 from cvtgs.cli.main import main
-from cvtgs.clock import StageClock
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
 from cvtgs.evaluation.scorer import ImageScores, scene_scores
-from cvtgs.grouping import allocation_at
 from cvtgs.levels import LevelEntry, LevelsIndex, level_names, write_levels
-from cvtgs.pipeline import reduce_scene
 from scenes import random_scene, same_bits
 
 RHOS = [0.2, 0.04, 0.004]
@@ -44,30 +41,13 @@ def test_counts_are_exact_and_in_the_order_of_the_ratios(scene, simplifier, rhos
 
 @pytest.mark.parametrize("config", ["standard", "paper", "draft"])
 @pytest.mark.slow
-def test_the_finest_level_equals_a_single_run(scene, config):
+def test_levels_equal_single_runs(scene, config):
     simplifier = Simplifier(config=config, device="cpu")
-    assert same_bits(simplifier.levels(scene, RHOS)[0].scene, simplifier.simplify(scene, RHOS[0]))
-
-
-def test_close_sizes_get_separate_tessellations(scene, simplifier):
-    levels = simplifier.levels(scene, [0.2, 0.1, 0.05])
-    assert [level.nested for level in levels] == [False, False, True]
-    assert same_bits(levels[1].scene, simplifier.simplify(scene, 0.1))
-
-
-def test_costs_of_every_level_are_at_its_ratio_to_the_gaussians_of_the_scene(scene, monkeypatch):
-    """Cells of a nested level are made from cells, but stand for all Gaussians in them."""
-    ratios = []
-
-    def noted(ratio, config):
-        ratios.append(ratio)
-        return allocation_at(ratio, config)
-
-    monkeypatch.setattr("cvtgs.grouping.allocation_at", noted)
-    config = cvtgs.SimplifyConfig.from_mapping({"filter": {"min_opacity": 0.0}})
-    levels = Simplifier(None, config=config, device="cpu").levels(scene, [0.2, 0.02])
-    assert [level.nested for level in levels] == [False, True]
-    assert ratios == pytest.approx([0.2, 0.02])
+    rhos = [1.0, *RHOS]
+    for level, rho in zip(simplifier.levels(scene, rhos), rhos, strict=True):
+        small, report = simplifier.run(scene, rho)
+        assert same_bits(level.scene, small)
+        assert level.report.filtered_count == report.filtered_count
 
 
 def test_errors_grow_and_are_zero_at_a_ratio_of_one(scene, simplifier):
@@ -75,21 +55,6 @@ def test_errors_grow_and_are_zero_at_a_ratio_of_one(scene, simplifier):
     assert errors[0] == 0.0
     assert errors == sorted(errors)
     assert len(set(errors)) == 4
-
-
-def test_coarse_cells_consist_of_whole_fine_ones(scene):
-    config, clock = cvtgs.SimplifyConfig(), StageClock(lambda event: None, scene.device)
-    analysis = analyze(scene, config)
-    finest = reduce_scene(scene, analysis, 600, config, net=None, clock=clock)
-    coarser = reduce_scene(scene, analysis, 60, config, net=None, clock=clock, finest=finest)
-    fine, coarse = finest.grouping.partition, coarser.grouping.partition
-    label = torch.full((len(scene),), -1)
-    label[coarse.order] = torch.repeat_interleave(coarse.counts)
-    for _, cell in fine.chunks(1):
-        assert len(set(label[cell.order].tolist())) == len(cell)
-    levels = cvtgs.Simplifier(None, device="cpu").levels(scene, [600 / len(scene), 60 / len(scene)])
-    assert [level.nested for level in levels] == [False, True]
-    assert same_bits(levels[1].scene, coarser.scene)
 
 
 def test_errors_are_weighted_by_the_mass_as_seen_from_the_middle():
@@ -210,7 +175,7 @@ def test_every_score_has_its_own_place_in_the_index():
     corner = (0.0, 0.0, 0.0)
     entry = LevelEntry(
         file="a.ply", rho=0.1, count=9, bytes=1, geometric_error=0.0, box_min=corner,
-        box_max=corner, nested=False, seconds=0.0,
+        box_max=corner, seconds=0.0,
     )  # fmt: skip
     values = {"psnr": 30.0, "ssim": 0.9, "lpips": 0.1, "alpha_error": 0.02, "alpha_bias": -0.01}
     found = entry.with_scores(scene_scores("a.ply", 9, [ImageScores(**values)]))

@@ -15,7 +15,6 @@ from cvtgs.config import AllocationConfig, SimplifyConfig
 from cvtgs.devices import HOST, move_together
 from cvtgs.filters import filter_rows
 from cvtgs.math.frames import RobustFrame, morton_order
-from cvtgs.math.segments import label_sums
 from cvtgs.scene import GaussianScene
 
 MEMBERS_PER_CELL = 4
@@ -36,21 +35,19 @@ class Grouping(NamedTuple):
 
     Attributes:
         partition: Rows of the scene that make up every cell.
-        weights: ``(m,)`` summed weights of the members of every cell.
         refilled: Number of cells that were empty after Lloyd and took a Gaussian from another.
         energies: Energy before every Lloyd iteration, over the Gaussians that Lloyd samples.
         energy: Energy of the final cells, over all Gaussians.
     """
 
     partition: cells.Partition
-    weights: Float[Tensor, "m"]
     refilled: int
     energies: tuple[float, ...]
     energy: float
 
 
 class WeightedRows(NamedTuple):
-    """Gaussians to group, in the order of the Morton curve; at a coarser level, merged Gaussians.
+    """Gaussians to group, in the order of the Morton curve.
 
     Attributes:
         scene: The Gaussians.
@@ -58,7 +55,6 @@ class WeightedRows(NamedTuple):
         weights: ``(k,)`` weights in the tessellation.
         masses: ``(k,)`` weights in the moments of a cell.
         apparent_masses: ``(k,)`` apparent masses, which scale the costs of merging.
-        members: Members of every merged Gaussian; None if these are Gaussians of the scene itself.
         moments: Moments of each Gaussian; None if not computed yet.
         neighbors: Gaussians that each may merge with; None if not computed yet.
     """
@@ -68,14 +64,8 @@ class WeightedRows(NamedTuple):
     weights: Float[Tensor, "k"]
     masses: Float[Tensor, "k"]
     apparent_masses: Float[Tensor, "k"]
-    members: cells.Partition | None = None
     moments: cells.Moments | None = None
     neighbors: Int[Tensor, "k j"] | None = None
-
-    @property
-    def total(self) -> int:
-        """The number of Gaussians of the full scene that these stand for."""
-        return len(self.rows if self.members is None else self.members.order)
 
 
 class OrderedRows(NamedTuple):
@@ -130,31 +120,6 @@ def weigh_rows(
         weights=weights,
         masses=analysis.areas.index_select(0, rows) * opacities,
         apparent_masses=masses,
-    )
-
-
-def weigh_cells(merged: GaussianScene, grouping: Grouping, analysis: SceneAnalysis) -> WeightedRows:
-    """Sort the merged Gaussians of a finer level, so that the cells of levels are nested.
-
-    Args:
-        merged: The merged Gaussians.
-        grouping: Their cells.
-        analysis: Frame of the scene.
-
-    Returns:
-        The merged Gaussians to group.
-    """
-    everything = torch.arange(len(merged), device=merged.device)
-    masses = grouping.weights * merged.opacities
-    rows = curve_order(merged, everything, analysis.frame, masses=masses)
-    weights = grouping.weights[rows]
-    return WeightedRows(
-        scene=merged,
-        rows=rows,
-        weights=weights,
-        masses=merged.masses[rows],
-        apparent_masses=weights,
-        members=grouping.partition,
     )
 
 
@@ -219,7 +184,7 @@ def allocate(
     if count == target and (is_own or not config.reassign):
         return labels
     members = points.moments or row_moments(points, analysis, config)
-    config = allocation_at(target / points.total, config)
+    config = allocation_at(target / len(labels), config)
     groups = members if is_own else cells.group_moments(members, labels, count)
     merged = torch.arange(count, device=labels.device)
     if count > target:
@@ -251,17 +216,9 @@ def collect_cells(
     Returns:
         The cells.
     """
-    weights = label_sums([points.weights], labels, target)[0]
-    rows = points.rows
-    if points.members is not None:
-        of_merged = torch.empty_like(labels)
-        of_merged[rows] = labels
-        rows = points.members.order
-        labels = torch.repeat_interleave(of_merged, points.members.counts)
     local = cells.Partition.from_labels(labels, target)
     return Grouping(
-        partition=replace(local, order=rows.index_select(0, local.order)),
-        weights=weights,
+        partition=replace(local, order=points.rows.index_select(0, local.order)),
         refilled=tessellation.refilled,
         energies=tessellation.energies,
         energy=tessellation.energy,

@@ -38,7 +38,6 @@ class LevelEntry(Record):
             that represent them, weighted by apparent mass; scene units. 0 if all are kept.
         box_min: Smallest coordinates of the centres in the file, in its axes, scene units.
         box_max: Largest coordinates of the centres in the file.
-        nested: Whether each of its cells consists of whole cells of the finest level.
         seconds: Wall-clock seconds in addition to the work shared with finer levels.
         psnr: Mean PSNR of the file against the full scene, dB; None if not measured.
         ssim: Mean SSIM, likewise.
@@ -55,7 +54,6 @@ class LevelEntry(Record):
     geometric_error: float
     box_min: Corner
     box_max: Corner
-    nested: bool
     seconds: float
     psnr: float | None = None
     ssim: float | None = None
@@ -85,7 +83,6 @@ class LevelEntry(Record):
             geometric_error=level.geometric_error,
             box_min=tuple(lowest.tolist()),
             box_max=tuple(highest.tolist()),
-            nested=level.nested,
             seconds=level.report.seconds,
         )
 

@@ -27,7 +27,6 @@ from cvtgs.grouping import (
     allocate,
     collect_cells,
     tessellate_rows,
-    weigh_cells,
     weigh_rows,
 )
 from cvtgs.math.segments import segment_ids
@@ -46,9 +45,6 @@ __all__ = [
 
 NEIGHBORS = 8
 """Number of neighbouring cells that may cover the ends of a cell, and that the network sees."""
-
-NESTED_FROM = 4
-"""A level is built from finer cells only if each of its cells holds this many on average."""
 
 CHUNK = 1 << 18
 """Gaussians per chunk of distances, to bound memory."""
@@ -76,18 +72,16 @@ class Reduced(NamedTuple):
         scene: The small scene.
         statistics: Statistics of the filter and the cells, for the report.
         grouping: The cells; None if all Gaussians are kept.
-        merged: One Gaussian per cell before the network; None if all Gaussians are kept.
         matching: Report of the matching to images; None if there was none.
     """
 
     scene: GaussianScene
     statistics: CellStatistics = CellStatistics()
     grouping: Grouping | None = None
-    merged: Merged | None = None
     matching: MatchReport | None = None
 
 
-def reduce_scene(  # noqa: PLR0913 (options by name)
+def reduce_scene(
     scene: GaussianScene,
     analysis: SceneAnalysis,
     target: int,
@@ -96,7 +90,6 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
     net: Net | None,
     clock: StageClock,
     total: int = 0,
-    finest: Reduced | None = None,
     ordered: OrderedRows | None = None,
 ) -> Reduced:
     """Run the stages after the analysis: filter, weigh, tessellate, allocate, merge, correct.
@@ -109,7 +102,6 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
         net: Network that corrects merged Gaussians, on the same device; None for no correction.
         clock: Measures each stage.
         total: Number of Gaussians before invalid rows were dropped.
-        finest: A finer level of the same scene, whose cells are grouped; None groups Gaussians.
         ordered: Result of :func:`cvtgs.grouping.order_rows` for the scene; None computes it.
 
     Returns:
@@ -119,18 +111,12 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
     if target >= len(scene.means):
         return Reduced(standardized(scene) if target < total else with_finite_opacities(scene))
     used = drop_unused_bands(scene, analysis.plan)
-    if finest is None or finest.merged is None or finest.grouping is None:
-        with clock.stage("filter"):
-            filtered = filter_rows(used, analysis, target, config.filter)
-        left_out, left_out_mass_share = filtered.left_out, filtered.left_out_mass_share
-        with clock.stage("weigh"):
-            points = weigh_rows(used, filtered.rows, analysis, config, ordered=ordered)
-        del filtered  # frees memory
-    else:
-        left_out = finest.statistics.filtered_count
-        left_out_mass_share = finest.statistics.filtered_mass_share
-        with clock.stage("weigh"):
-            points = weigh_cells(finest.merged.scene, finest.grouping, analysis)
+    with clock.stage("filter"):
+        filtered = filter_rows(used, analysis, target, config.filter)
+    left_out, left_out_mass_share = filtered.left_out, filtered.left_out_mass_share
+    with clock.stage("weigh"):
+        points = weigh_rows(used, filtered.rows, analysis, config, ordered=ordered)
+    del filtered  # frees memory
     with clock.stage("tessellate", config.cvt.iterations + 1) as advance:
         tessellation = tessellate_rows(points, analysis, target, config, on_iteration=advance)
     with clock.stage("allocate"):
@@ -170,7 +156,7 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
         energy=grouping.energy,
         backend=cvt.SEARCH,
     )
-    return Reduced(small, statistics, grouping, merged)
+    return Reduced(small, statistics, grouping)
 
 
 def merge_and_inflate(
@@ -265,11 +251,6 @@ def _of_input(labels: Int[Tensor, "v"], is_valid: Bool[Tensor, "n"] | None) -> I
     found = labels.new_full((len(is_valid),), -1)
     found[is_valid] = labels
     return found.cpu()
-
-
-def nests_in(target: int, finest: Reduced | None) -> bool:
-    """Check whether a level is to be built from the cells of a finer one."""
-    return finest is not None and NESTED_FROM * target <= len(finest.scene)
 
 
 def geometric_error(

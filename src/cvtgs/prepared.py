@@ -26,7 +26,7 @@ from cvtgs.devices import chosen_device, within_memory, without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.grouping import OrderedRows, add_neighbors, order_rows
 from cvtgs.mergenet import Checkpoint, Net
-from cvtgs.pipeline import Reduced, level_facts, nests_in, reduce_scene
+from cvtgs.pipeline import Reduced, level_facts, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified, SimplifyReport, origin_of_views
 from cvtgs.scene import GaussianScene, concatenate
@@ -221,11 +221,12 @@ class Prepared:
     ) -> dict[int, Level]:
         self._begin(device, note)
         found: dict[int, Level] = {}
-        finest: Reduced | None = None
         for target in sorted(set(targets), reverse=True):
             clock = StageClock(self._listener, device)
             checked, analysis = self._analyze(target, clock)
-            valid, nested = checked.scene, nests_in(target, finest)
+            valid = checked.scene
+            self._order(valid, analysis, target, clock)
+            self._has_run = target < len(valid)
             reduced = reduce_scene(
                 valid,
                 analysis,
@@ -234,14 +235,12 @@ class Prepared:
                 net=self._net,
                 clock=clock,
                 total=self._total,
-                finest=finest if nested else None,
+                ordered=self._ordered,
             )
-            if reduced.grouping is not None:
-                finest = finest or reduced
             error, assignment = level_facts(valid, analysis, reduced, is_valid=checked.is_valid)
             matched = self._match(reduced, analysis, clock)
             result = self._result(matched, checked, analysis, target, clock)
-            found[target] = Level(*result, error, nested, assignment)
+            found[target] = Level(*result, error, assignment)
         return found
 
     def _analyze(self, target: int, clock: StageClock) -> tuple[CheckedScene, SceneAnalysis]:

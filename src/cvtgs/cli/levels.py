@@ -47,8 +47,8 @@ def add_levels(add_parser: AddParser) -> None:
         help="simplify a scene to several sizes at once",
         description="Write IN in several sizes, each an ordinary scene of exactly ceil(rho * N) "
         "Gaussians, and levels.json with counts, bytes, scores, geometric errors and boxes. This "
-        "takes about 1.5 times as long as the finest size alone, plus the time for scoring, which "
-        "--no-scores skips.",
+        "takes about 1.6 times as long as the finest of three sizes, plus the time for scoring, "
+        "which --no-scores skips.",
     )
     parser.set_defaults(run=levels)
     add_options(parser, "input", "-o/--output")

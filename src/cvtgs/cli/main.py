@@ -174,9 +174,12 @@ class _Stop:
             return
         if event.exc_type is KeyboardInterrupt:
             number = signal.SIGINT if self.code == INTERRUPTED else signal.SIGTERM
-            again = threading.Timer(0.01, signal.raise_signal, (number,))
-            again.daemon = True
-            again.start()
+            while True:
+                with suppress(KeyboardInterrupt):  # on a busy machine, it comes before the end
+                    again = threading.Timer(0.01, signal.raise_signal, (number,))
+                    again.daemon = True
+                    again.start()
+                    return
 
 
 def build_parser() -> CommandParser:

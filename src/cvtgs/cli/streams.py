@@ -155,7 +155,8 @@ def stream_blocks(
             targets = {cvtgs.target_count(rows.count, rho) for rho in rhos}
             finest = max(targets - {rows.count}, default=rows.count)  # a whole level merges nothing
             merging = finer_count(finest, rows.count, config.allocation)
-            if block_count(rows, memory, merging=merging) == 1:
+            # Levels one after the other need up to 60 bytes more per Gaussian than the finest.
+            if block_count(rows, memory, merging=merging + merging // 4) == 1:
                 return False
         check_config(config, with_images=False)
     except (InputError, FileFormatError, ConfigError):

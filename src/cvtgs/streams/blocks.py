@@ -34,7 +34,7 @@ from cvtgs.outofcore.rows import analysis_of, read_rows
 from cvtgs.outofcore.run import rows_per_range
 from cvtgs.outofcore.sort import sort_into_blocks
 from cvtgs.outofcore.workers import sequentially, started, with_progress
-from cvtgs.pipeline import Reduced, level_facts, nests_in, reduce_scene
+from cvtgs.pipeline import level_facts, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.scene import GaussianScene
 from cvtgs.simplifier import Simplifier
@@ -331,16 +331,13 @@ def reduce_levels(
     *,
     net: Net | None,
 ) -> list[BlockLevel]:
-    """Simplify valid Gaussians to descending sizes; coarse levels merge cells of the finest."""
+    """Simplify valid Gaussians to descending sizes."""
     found: list[BlockLevel] = []
-    finest: Reduced | None = None
     clock = StageClock(silent, scene.device)
     for target in targets:
         if target >= len(scene):
             found.append(BlockLevel(with_finite_opacities(scene), 0.0, None))
             continue
-        start = finest if nests_in(target, finest) else None
-        reduced = reduce_scene(scene, analysis, target, config, net=net, clock=clock, finest=start)
-        finest = finest or reduced
+        reduced = reduce_scene(scene, analysis, target, config, net=net, clock=clock)
         found.append(BlockLevel(reduced.scene, *level_facts(scene, analysis, reduced)))
     return found

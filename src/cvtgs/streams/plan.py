@@ -1,9 +1,8 @@
 """Divide the Gaussians of every level into chunks, so that chunks of different levels fit together.
 
 Chunks are formed from the Gaussians of the coarsest level. A Gaussian of a finer level belongs to
-the chunk of the coarse Gaussian that replaces most of its input rows, wherever its centre is. If
-levels are nested, all levels of a chunk therefore show the same part of the scene, and between
-neighbouring chunks of different levels, nothing is missing and nothing is shown twice.
+the chunk of the coarse Gaussian that replaces most of its input rows, wherever its centre is. So
+all levels of a chunk show the same part of the scene, but for a few Gaussians at its border.
 """
 
 from collections.abc import Iterable, Sequence
