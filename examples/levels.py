@@ -1,4 +1,4 @@
-"""Make all levels of detail for a viewer in one run, in little more time than the finest alone.
+"""Make all levels of detail for a viewer in one run, in less time than separate runs.
 
 python examples/levels.py scene.ply levels --rho 0.25,0.05,0.01 --suffix .spz
 """
