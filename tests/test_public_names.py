@@ -163,6 +163,7 @@ STAGES = {
         "Moments",
         "gather_members",
         "gaussian_moments",
+        "mass_unit",
         "group_moments",
         "merge_pairs",
         "reassign",

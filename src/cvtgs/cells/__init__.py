@@ -13,7 +13,13 @@ from cvtgs.cells.merge import (
     merged_depth,
     normalized_weights,
 )
-from cvtgs.cells.moments import Moments, gaussian_moments, group_moments, view_components
+from cvtgs.cells.moments import (
+    Moments,
+    gaussian_moments,
+    group_moments,
+    mass_unit,
+    view_components,
+)
 from cvtgs.cells.partition import Partition, SampledMembers, sample_members
 
 __all__ = [
@@ -29,6 +35,7 @@ __all__ = [
     "group_moments",
     "inflate_cells",
     "keep_representatives",
+    "mass_unit",
     "mean_and_covariance",
     "merge_cells",
     "merge_pairs",

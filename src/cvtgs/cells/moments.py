@@ -82,7 +82,8 @@ def gaussian_moments(
         weights: Mass of each.
         masses: Mass of each as seen in images.
         components: Result of :func:`view_components`; None for no view-dependent colour.
-        unit: Divisor of weights and masses; None divides each by its own :func:`mass_unit`.
+        unit: Divisor of weights and masses; None divides each by its own
+            :func:`cvtgs.cells.mass_unit`.
 
     Returns:
         The moments, in the order of the rows.

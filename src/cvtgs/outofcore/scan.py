@@ -184,7 +184,7 @@ class SceneScan:
         view_components: Components of the view-dependent colour
             (:func:`cvtgs.cells.view_components`).
         mass: Opacity times mean projected area of all valid Gaussians, squared scene units.
-        mass_unit: Unit of the masses in moments (:func:`cvtgs.cells.moments.mass_unit`).
+        mass_unit: Unit of the masses in moments (:func:`cvtgs.cells.mass_unit`).
         invalid_rows: Rows that are dropped, by the attribute that is NaN, infinite or zero.
         row_count: Number of valid Gaussians outside boxes.
         kept_count: Number of valid Gaussians in boxes.
@@ -321,7 +321,7 @@ def scan_scene(
         partition=partition_space(frame.contract(sample.means[rows]), measure, blocks),
         view_components=_view_components(sample, known, rows, config),
         mass=totals.mass,
-        mass_unit=float(cells.moments.mass_unit(known.areas * known.opacities, mean_mass)),
+        mass_unit=float(cells.mass_unit(known.areas * known.opacities, mean_mass)),
         invalid_rows=totals.invalid_rows,
         row_count=row_count,
         kept_count=totals.kept_count,
