@@ -5,9 +5,9 @@ import pytest
 import torch
 
 import cvtgs
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import FileFormatError, InvalidArgumentError
 from cvtgs.evaluation import fit_cameras, load_photographs
-from cvtgs.evaluation.images import encode
+from cvtgs.evaluation.images import encode, read_image
 
 
 def test_a_photograph_of_two_cameras_is_an_error(tmp_path):
@@ -47,3 +47,11 @@ def test_grey_of_16_bits_is_that_of_8(suffix, tmp_path):
     found = load_photographs(tmp_path, one)[0]
     for channel in range(3):
         assert (found[:, :, channel] * 255).round().byte().numpy().tolist() == values.tolist()
+
+
+def test_an_image_of_floats_is_refused(tmp_path):
+    from PIL import Image  # noqa: PLC0415
+
+    Image.fromarray(np.full((16, 16), 0.5, dtype=np.float32)).save(tmp_path / "a.tif")
+    with pytest.raises(FileFormatError, match=r"a\.tif: must hold whole numbers, found an image"):
+        read_image(tmp_path / "a.tif", (16, 16), (0.0, 0.0, 0.0))

@@ -115,7 +115,9 @@ def read_image(
         image: Image.Image = file
         if file.mode.startswith("I"):  # grey of 16 bits, which convert would clip at 255
             image = Image.fromarray((np.asarray(file) >> 8).clip(0, 255).astype(np.uint8))
-        whole = image.convert("RGBA")
+        whole, mode = image.convert("RGBA"), file.mode
+    if mode == "F":  # convert would make values from 0 to 1 black
+        raise FileFormatError(f"{path}: must hold whole numbers, found an image of floats.")
     pixels = np.asarray(whole.resize(size, Image.Resampling.LANCZOS), dtype=np.float32) / 255
     alpha = pixels[:, :, 3:]
     colors = pixels[:, :, :3] * alpha + np.asarray(background, dtype=np.float32) * (1 - alpha)
