@@ -152,19 +152,7 @@ class Prepared:
         checked, analysis = self._analyze(target, clock)
         valid = checked.scene
         if keep is None or not bool(keep.any()):
-            self._order(valid, analysis, target, clock)
-            self._has_run = True
-            reduced = reduce_scene(
-                valid,
-                analysis,
-                target,
-                self._config,
-                net=self._net,
-                clock=clock,
-                total=self._total,
-                ordered=self._ordered,
-            )
-            reduced = self._match(reduced, analysis, clock)
+            reduced = self._match(self._reduce(valid, analysis, target, clock), analysis, clock)
             return self._result(reduced, checked, analysis, target, clock)
         keep = keep.to(valid.device)
         kept = keep if checked.is_valid is None else keep[checked.is_valid]
@@ -225,18 +213,7 @@ class Prepared:
             clock = StageClock(self._listener, device)
             checked, analysis = self._analyze(target, clock)
             valid = checked.scene
-            self._order(valid, analysis, target, clock)
-            self._has_run = target < len(valid)
-            reduced = reduce_scene(
-                valid,
-                analysis,
-                target,
-                self._config,
-                net=self._net,
-                clock=clock,
-                total=self._total,
-                ordered=self._ordered,
-            )
+            reduced = self._reduce(valid, analysis, target, clock)
             error, assignment = level_facts(valid, analysis, reduced, is_valid=checked.is_valid)
             matched = self._match(reduced, analysis, clock)
             result = self._result(matched, checked, analysis, target, clock)
@@ -275,6 +252,23 @@ class Prepared:
                     )
             self._analysis = analysis
         return checked, analysis
+
+    def _reduce(
+        self, valid: GaussianScene, analysis: SceneAnalysis, target: int, clock: StageClock
+    ) -> Reduced:
+        """Run the stages after the analysis, with what earlier runs have cached."""
+        self._order(valid, analysis, target, clock)
+        self._has_run = self._has_run or target < len(valid)
+        return reduce_scene(
+            valid,
+            analysis,
+            target,
+            self._config,
+            net=self._net,
+            clock=clock,
+            total=self._total,
+            ordered=self._ordered,
+        )
 
     def _order(
         self, valid: GaussianScene, analysis: SceneAnalysis, target: int, clock: StageClock

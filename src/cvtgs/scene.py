@@ -22,7 +22,7 @@ from cvtgs.text import shown
 
 ANTIALIASED_TAG = "SplatRenderMode: mip"
 """The comment of scenes that were trained with anti-aliasing (Mip-Splatting)."""
-ANTIALIASED_TAGS = re.compile(rf"(?im){ANTIALIASED_TAG}|^\s*antialiased\s+1\s*$")
+ANTIALIASED_PATTERN = re.compile(rf"(?im){ANTIALIASED_TAG}|^\s*antialiased\s+1\s*$")
 """Matches this comment, which Brush also writes, and that of Postshot."""
 FLAT_LOG_SCALE = -20.0
 """Third log-scale of Gaussians with two scales (2DGS): two billionths of a scene unit."""
@@ -159,7 +159,7 @@ class GaussianScene:
     @property
     def antialiased(self) -> bool:
         """Whether the scene was trained with anti-aliasing and must be rendered with it."""
-        return any(map(ANTIALIASED_TAGS.search, self.comments))
+        return any(map(ANTIALIASED_PATTERN.search, self.comments))
 
     @property
     def has_two_scales(self) -> bool:

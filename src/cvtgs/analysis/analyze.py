@@ -15,7 +15,7 @@ from cvtgs.losses import SSIM_WINDOW
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import divide
 from cvtgs.rendering import ObservedViews, contributions, observe
-from cvtgs.scene import ANTIALIASED_TAGS, FLAT_LOG_SCALE, GaussianScene
+from cvtgs.scene import ANTIALIASED_PATTERN, FLAT_LOG_SCALE, GaussianScene
 from cvtgs.views import mixed_views
 
 MIN_OPACITY = 1e-6
@@ -311,7 +311,7 @@ def drop_mip_tag(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
     if plan.mip.active or not scene.antialiased:
         return scene
     return replace(
-        scene, comments=tuple(c for c in scene.comments if not ANTIALIASED_TAGS.search(c))
+        scene, comments=tuple(c for c in scene.comments if not ANTIALIASED_PATTERN.search(c))
     )
 
 

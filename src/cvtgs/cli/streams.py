@@ -155,7 +155,7 @@ def stream_blocks(
             targets = {cvtgs.target_count(rows.count, rho) for rho in rhos}
             finest = max(targets - {rows.count}, default=rows.count)  # a whole level merges nothing
             merging = finer_count(finest, rows.count, config.allocation)
-            # Levels one after the other need up to 60 bytes more per Gaussian than the finest.
+            # Levels one after the other need a little more memory than the finest alone.
             if block_count(rows, memory, merging=merging + merging // 4) == 1:
                 return False
         check_config(config, with_images=False)

@@ -7,7 +7,7 @@ from types import MappingProxyType
 import torch
 
 from cvtgs.math.spherical_harmonics import REST_COUNTS
-from cvtgs.scene import ANTIALIASED_TAG, ANTIALIASED_TAGS, GaussianScene
+from cvtgs.scene import ANTIALIASED_PATTERN, ANTIALIASED_TAG, GaussianScene
 from cvtgs.text import counted
 from cvtgs.validity import writable_rows
 
@@ -144,7 +144,7 @@ def losses_within(scene: GaussianScene, limits: FormatLimits) -> Losses:
     changed = list(limits.changed)
     if scene.sh_degree > 0 and limits.changed_bands:
         changed.append(limits.changed_bands)
-    others = [line for line in scene.comments if not ANTIALIASED_TAGS.search(line)]
+    others = [line for line in scene.comments if not ANTIALIASED_PATTERN.search(line)]
     if others and not limits.comments:
         changed.append(f"without {counted(len(others), 'comment')}")
     return Losses(

@@ -46,7 +46,7 @@ from cvtgs.io.gltf.document import (
 from cvtgs.io.spz import decode_spz
 from cvtgs.math.parameters import matrices_to_quats
 from cvtgs.math.spherical_harmonics import REST_COUNTS
-from cvtgs.scene import ANTIALIASED_TAGS, GaussianScene
+from cvtgs.scene import ANTIALIASED_PATTERN, GaussianScene
 from cvtgs.text import printable, shown
 
 _KNOWN = (SPLATS, SPZ, QUANTIZATION)
@@ -290,7 +290,7 @@ def _with_comments(scene: GaussianScene, extras: Any) -> GaussianScene:
         for line in (lines if isinstance(lines, list) else ())
         if isinstance(line, str) and "\n" not in line
     ]
-    tagged = any(map(ANTIALIASED_TAGS.search, comments))
+    tagged = any(map(ANTIALIASED_PATTERN.search, comments))
     own = () if tagged else scene.comments
     return replace(scene, comments=(*own, *comments))
 
