@@ -219,6 +219,7 @@ def test_values_are_not_checked():
 def test_repr_shows_no_values():
     scene = random_scene(1234, degree=3)
     assert repr(scene) == "GaussianScene(1,234 Gaussians, SH degree 3, float32, cpu)"
+    assert repr(scene.select(slice(1))) == "GaussianScene(1 Gaussian, SH degree 3, float32, cpu)"
 
 
 @pytest.mark.parametrize(

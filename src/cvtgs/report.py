@@ -13,6 +13,7 @@ from cvtgs.clock import StageCost
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.scene import GaussianScene
+from cvtgs.text import counted
 
 
 class RefineReport(Record):
@@ -154,7 +155,7 @@ class SimplifyReport(CellStatistics):
     def __repr__(self) -> str:
         """Return counts, seconds and preset; :meth:`to_json` has the rest."""
         return (
-            f"SimplifyReport({self.input_count:,} -> {self.output_count:,} Gaussians, "
+            f"SimplifyReport({self.input_count:,} -> {counted(self.output_count, 'Gaussian')}, "
             f"{self.seconds:.2f} s, preset {self.config.preset}, checkpoint {self.checkpoint}, "
             f"{self.device})"
         )

@@ -18,7 +18,7 @@ from cvtgs.devices import usable_device
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.selection import row_numbers
-from cvtgs.text import shown
+from cvtgs.text import counted, shown
 
 ANTIALIASED_TAG = "SplatRenderMode: mip"
 """The comment of scenes that were trained with anti-aliasing (Mip-Splatting)."""
@@ -317,7 +317,7 @@ class GaussianScene:
     def __repr__(self) -> str:
         """Return count, degree, dtype and device, not the values."""
         return (
-            f"GaussianScene({len(self):,} Gaussians, SH degree {self.sh_degree}, "
+            f"GaussianScene({counted(len(self), 'Gaussian')}, SH degree {self.sh_degree}, "
             f"{str(self.dtype).removeprefix('torch.')}, {self.device})"
         )
 

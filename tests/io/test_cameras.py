@@ -278,6 +278,17 @@ def test_distortion_in_transforms_json_is_warned_about(given, tmp_path) -> None:
     assert str(warning.message) == f"{path}: {DISTORTION.format(1, len(NAMES))}"
 
 
+def test_a_colmap_model_with_byte_order_marks_is_read(tmp_path) -> None:
+    colmap_txt(tmp_path, rows=range(2))
+    plain = load_cameras(tmp_path)
+    for name in ("cameras.txt", "images.txt"):
+        file = tmp_path / name
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    marked = load_cameras(tmp_path)
+    assert marked.names == plain.names
+    assert torch.equal(marked.Ks, plain.Ks)
+
+
 def test_text_models_with_spaces_in_names_and_points_are_read(tmp_path) -> None:
     colmap_txt(tmp_path, rows=range(2), names=["b c.jpg", "a  d.jpg"], points="1 2 3 4.5 5 -1")
     assert load_cameras(tmp_path).names == ("a  d.jpg", "b c.jpg")

@@ -28,7 +28,7 @@ def test_a_row_made_by_hand_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a.splat"
     path.write_bytes(struct.pack("<6f8B", 1, 2, 3, 1, 2, math.e, 255, 0, 0, 51, 128, 255, 128, 128))
     scene = load(path)
-    assert repr(scene) == "GaussianScene(1 Gaussians, SH degree 0, float32, cpu)"
+    assert repr(scene) == "GaussianScene(1 Gaussian, SH degree 0, float32, cpu)"
     assert scene.means.tolist() == [[1, 2, 3]]
     torch.testing.assert_close(scene.log_scales, torch.tensor([[0, math.log(2), 1]]))
     torch.testing.assert_close(scene.opacities, torch.tensor([0.2]))

@@ -22,7 +22,7 @@ from cvtgs.cli.jobs import (
 )
 from cvtgs.cli.options import AddParser, add_options, read_axes, read_scene, read_settings
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
-from cvtgs.text import printable
+from cvtgs.text import counted, printable
 
 if TYPE_CHECKING:
     from cvtgs.analysis import Effect
@@ -115,7 +115,7 @@ class SceneEdits:
         phrases = []
         for phrase, smaller in self._filtered(scene):
             if len(smaller) < len(scene):
-                phrases.append(f"{len(scene) - len(smaller):,} Gaussians ({phrase})")
+                phrases.append(f"{counted(len(scene) - len(smaller), 'Gaussian')} ({phrase})")
             scene = smaller
         if len(scene) == 0:
             raise InvalidArgumentError(
@@ -371,4 +371,4 @@ def _convert_one(job: SceneJob, edits: SceneEdits) -> Outcome:
         )
     lines = [*phrases, *lost.dropped]
     notes = [f"Lost: {'; '.join(lines)}."] if job.is_one_of_many and lines else []
-    return Outcome(f"{lost.count:,} Gaussians of SH degree {lost.sh_degree}", notes=notes)
+    return Outcome(f"{counted(lost.count, 'Gaussian')} of SH degree {lost.sh_degree}", notes=notes)

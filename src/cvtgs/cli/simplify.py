@@ -194,7 +194,7 @@ def _simplify_one(
         notes.append(f"{kept} in the boxes of --keep.")
     total = time.perf_counter() - options.begun if searched else report.seconds
     return Outcome(
-        f"{report.input_count:,} -> {report.output_count:,} Gaussians",
+        f"{report.input_count:,} -> {counted(report.output_count, 'Gaussian')}",
         f"{total:.2f} s",
         notes + report_notes(report),
     )

@@ -29,6 +29,7 @@ from cvtgs.evaluation.scorer import SceneScores
 from cvtgs.io import atomic_output, check_output
 from cvtgs.io.atomic import make_folder
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
+from cvtgs.text import counted
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -122,7 +123,7 @@ def contact_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
     """Draw all views of all scenes: a row per scene, the full one first; a column per view."""
     evaluation = comparison.evaluation
     size = bytes_text(comparison.sizes.get(evaluation.reference))
-    full = [f"{evaluation.reference_count:,} Gaussians", size]
+    full = [counted(evaluation.reference_count, "Gaussian"), size]
     rows = [_Row(evaluation.reference, full, comparison.full.colors)]
     rows += [
         _small_row(comparison, scores, comparison.small[scores.name].colors)
@@ -161,7 +162,7 @@ def error_maps(comparison: Comparison, name: str) -> tuple[Images, Images]:
 
 def _small_row(comparison: Comparison, scores: SceneScores, images: Images) -> _Row:
     lines = [
-        f"{scores.count:,} Gaussians",
+        counted(scores.count, "Gaussian"),
         _ratio_text(comparison.ratio(scores)),
         bytes_text(comparison.sizes.get(scores.name)),
         f"PSNR {_psnr_text(scores.psnr.mean)}",

@@ -1,5 +1,6 @@
 """Read sparse COLMAP models: a file of cameras and a file of images, binary or text."""
 
+import codecs
 import math
 import os
 import struct
@@ -283,7 +284,8 @@ def _image_of_line(line: str, where: str) -> _Image:
 
 def _lines(file: BinaryIO) -> Iterator[tuple[int, str]]:
     for number, line in enumerate(file, start=1):
-        yield number, os.fsdecode(line).strip()
+        text = line.removeprefix(codecs.BOM_UTF8) if number == 1 else line
+        yield number, os.fsdecode(text).strip()
 
 
 def _wrong(where: str, required: str, line: str) -> FileFormatError:

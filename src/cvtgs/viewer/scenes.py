@@ -16,6 +16,7 @@ from cvtgs.prepared import Prepared
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
 from cvtgs.simplifier import Simplifier
+from cvtgs.text import counted
 from cvtgs.validity import valid_part
 
 __all__ = ["SceneViewer", "ShownScene"]
@@ -144,7 +145,7 @@ class SceneViewer:
             raise OutputError("a file name is needed to save a scene, found none.")
         scene = self._named(name)
         save(scene, path)
-        return f"{os.fspath(path)}: {len(scene):,} Gaussians."
+        return f"{os.fspath(path)}: {counted(len(scene), 'Gaussian')}."
 
     def _named(self, name: str) -> GaussianScene:
         if name not in self.scenes:
@@ -155,7 +156,7 @@ class SceneViewer:
 def _counted(scene: GaussianScene, full: GaussianScene) -> str:
     columns = 17 + 3 * scene.shN.shape[1]
     size = 4e-6 * columns * len(scene)
-    return f"{len(scene):,} of {len(full):,} Gaussians, {size:,.3g} MB as .ply"
+    return f"{len(scene):,} of {counted(len(full), 'Gaussian')}, {size:,.3g} MB as .ply"
 
 
 def camera_of(

@@ -25,7 +25,7 @@ from cvtgs.math.frames import robust_frame
 from cvtgs.math.parameters import build_covariances, normalize_quats
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
-from cvtgs.text import printable
+from cvtgs.text import counted, printable
 from cvtgs.validity import valid_part
 from cvtgs.viewer.scenes import FULL, SIMPLIFIED, SceneViewer, camera_of
 from cvtgs.views import automatic_views
@@ -107,7 +107,9 @@ class SceneNode:
             visible=visible,
         )
         self._server.scene.add_label(
-            f"{self._path}/name", f"{self._name}: {len(part):,} Gaussians", position=self._label
+            f"{self._path}/name",
+            f"{self._name}: {counted(len(part), 'Gaussian')}",
+            position=self._label,
         )
 
     def show(self, visible: bool) -> None:
