@@ -1,7 +1,9 @@
 """Camera files of every format, compared with one hand-made rig of cameras."""
 
 import json
+import locale
 import math
+import os
 import struct
 import warnings
 from collections.abc import Mapping
@@ -298,6 +300,16 @@ def test_binary_models_with_long_names_and_points_are_read(tmp_path) -> None:
     names = ["ä/b c.jpg", "x" * 3000]
     colmap_bin(tmp_path, rows=range(2), names=names, points=1000)
     assert load_cameras(tmp_path).names == tuple(sorted(names))
+
+
+@pytest.mark.parametrize("write", [colmap_txt, colmap_bin])
+def test_names_in_the_other_encoding_of_windows_are_read(tmp_path, monkeypatch, write) -> None:
+    write(tmp_path, rows=range(2), names=["a.jpg", "K~che.jpg"])
+    path = next(tmp_path.glob("images.*"))
+    path.write_bytes(path.read_bytes().replace(b"~", b"\xfc"))
+    monkeypatch.setattr(os, "fsdecode", lambda name: name.decode("utf-8", "surrogatepass"))
+    monkeypatch.setattr(locale, "getencoding", lambda: "cp1252")
+    assert load_cameras(tmp_path).names == ("Küche.jpg", "a.jpg")
 
 
 def test_quaternions_are_normalised(tmp_path) -> None:

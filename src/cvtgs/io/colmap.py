@@ -1,6 +1,7 @@
 """Read sparse COLMAP models: a file of cameras and a file of images, binary or text."""
 
 import codecs
+import locale
 import math
 import os
 import struct
@@ -190,7 +191,7 @@ class _Bytes:
                 f"found no end."
             )
         self.file.seek(start + len(text) + 1)
-        return os.fsdecode(text)
+        return _text_of(text)
 
     def check(self, size: int, what: str) -> None:
         if size > self.left():
@@ -285,7 +286,15 @@ def _image_of_line(line: str, where: str) -> _Image:
 def _lines(file: BinaryIO) -> Iterator[tuple[int, str]]:
     for number, line in enumerate(file, start=1):
         text = line.removeprefix(codecs.BOM_UTF8) if number == 1 else line
-        yield number, os.fsdecode(text).strip()
+        yield number, _text_of(text).strip()
+
+
+def _text_of(content: bytes) -> str:
+    """Decode a name as this system names files; Windows has two encodings, and COLMAP uses both."""
+    try:
+        return os.fsdecode(content)
+    except UnicodeDecodeError:  # not UTF-8, which Windows demands
+        return content.decode(locale.getencoding(), "surrogateescape")
 
 
 def _wrong(where: str, required: str, line: str) -> FileFormatError:
