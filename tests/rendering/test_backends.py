@@ -123,6 +123,24 @@ def test_numba_leaves_the_threads_of_torch_as_they_are(monkeypatch):
     assert lines == ["1", "2", "3"]
 
 
+@pytest.mark.slow
+def test_threads_can_render_at_the_same_time_without_openmp():
+    """As on machines without its library (libgomp1, absent in slim images of Docker)."""
+    pytest.importorskip("numba")
+    program = (
+        "import numba, threading, torch\n"
+        "from cvtgs import render, synthetic, views\n"
+        "torch.set_num_threads(2)\n"
+        "scene = synthetic.scene('object', 2000, sh_degree=0)\n"
+        "cameras = views.automatic_views(scene, 8, width=96, height=64)\n"
+        "started = [threading.Thread(target=render, args=(scene, cameras)) for _ in range(6)]\n"
+        "for thread in started: thread.start()\n"
+        "for thread in started: thread.join()\n"
+        "print(numba.threading_layer(), 'done')\n"
+    )
+    assert python(program, NUMBA_THREADING_LAYER="workqueue") == ["workqueue done"]
+
+
 def test_numba_is_installed_with_the_package_where_it_has_wheels():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     (found,) = [Requirement(n) for n in project["dependencies"] if n.startswith("numba")]

@@ -6,7 +6,10 @@ writable: then every process compiles again. A kernel's cache notices changes in
 after changing a function that kernels in other files call, clear the cache.
 """
 
+import threading
 from collections.abc import Callable
+from contextlib import nullcontext
+from functools import wraps
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -53,8 +56,32 @@ def serial(function: F) -> F:
 
 
 def parallel(function: F) -> F:
-    """Compile a function whose outer loop runs over :data:`prange`."""
-    return _compiled(function, **_SETTINGS, parallel=True)
+    """Compile a function whose outer loop runs over :data:`prange`; only Python may call it.
+
+    Without OpenMP and TBB, the threads of numba take one loop at a time, and end the process at a
+    second one; so threads of the program wait for each other there.
+    """
+    compiled = _compiled(function, **_SETTINGS, parallel=True)
+
+    @wraps(function)
+    def call(*arguments: Any) -> object:
+        with nullcontext() if _takes_several_loops() else _Turn.lock:
+            return compiled(*arguments)
+
+    return cast("F", call)
+
+
+class _Turn:
+    """The turn of a thread where numba takes one loop at a time."""
+
+    lock = threading.Lock()
+
+
+def _takes_several_loops() -> bool:
+    try:
+        return bool(vars(numba)["threading_layer"]() != "workqueue")
+    except ValueError:  # chosen in the first loop
+        return False
 
 
 def _compiled(function: F, **settings: Any) -> F:
