@@ -25,6 +25,15 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+MOST_ON_WINDOWS = 61
+"""Largest number of processes that a pool of Python has on Windows."""
+
+
+def pool_size(count: int) -> int:
+    """Return the number of processes that a pool can have on this system, at most ``count``."""
+    return min(count, MOST_ON_WINDOWS) if sys.platform == "win32" else count
+
+
 class LocalWorkers:
     """Context manager that calls functions in processes of this machine.
 
@@ -32,7 +41,7 @@ class LocalWorkers:
     code with ``if __name__ == "__main__":``, since they import it.
 
     Args:
-        count: Number of processes.
+        count: Number of processes; Windows allows at most 61, which are used if it is larger.
         remedy: What to do when a process ends unexpectedly, for the error message.
 
     Raises:
@@ -44,7 +53,7 @@ class LocalWorkers:
             raise InvalidArgumentError(
                 f"the number of processes must be at least 1, found {count}."
             )
-        self._count, self._remedy = count, remedy
+        self._count, self._remedy = pool_size(count), remedy
 
     def __enter__(self) -> Self:
         from cvtgs.devices import core_count  # noqa: PLC0415 (loads torch; see _begin)

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from functools import partial
+from unittest.mock import MagicMock
 
 import psutil
 import pytest
@@ -127,6 +128,18 @@ def test_no_process_is_left_behind_and_the_run_continues(source, tmp_path, sign)
 )
 def test_the_number_of_workers_follows_memory_and_cores(memory, wanted, found):
     assert worker_count(memory, wanted) == (found or core_count())
+
+
+def test_windows_gets_no_more_processes_than_a_pool_has_there(monkeypatch):
+    pools = []
+    monkeypatch.setattr(
+        "cvtgs.processes.ProcessPoolExecutor",
+        lambda count, *rest, **named: pools.append(count) or MagicMock(),
+    )
+    monkeypatch.setattr(sys, "platform", "win32")
+    with LocalWorkers(100):
+        pass
+    assert (worker_count(2**60, 100), pools) == (61, [61])
 
 
 def test_workers_of_the_command_share_the_memory(source, tmp_path, monkeypatch, capsys):

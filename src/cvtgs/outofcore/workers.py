@@ -12,6 +12,7 @@ from cvtgs.errors import CvtgsError
 from cvtgs.mergenet import Checkpoint
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.memory import ROOMY_BYTES
+from cvtgs.processes import pool_size
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -79,10 +80,11 @@ def worker_count(memory: int, wanted: int | None = None) -> int:
         wanted: The wanted number; None for one per core.
 
     Returns:
-        At least 1, and at most one per GB, which torch and a block of some size need.
+        At least 1, and at most one per GB, which torch and a block of some size need; on Windows,
+        at most 61.
 
     Example:
         >>> worker_count(4_000_000_000, 8)
         4
     """
-    return max(1, min(wanted or core_count(), memory // (2 * ROOMY_BYTES)))
+    return pool_size(max(1, min(wanted or core_count(), memory // (2 * ROOMY_BYTES))))
