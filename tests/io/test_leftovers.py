@@ -1,9 +1,12 @@
 """Leftovers of killed runs, loops of links, names on Windows, maps of replaced files."""
 
+import errno
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path, PureWindowsPath
+from typing import NoReturn
 
 import numpy as np
 import pytest
@@ -118,6 +121,76 @@ def test_invalid_windows_names_are_refused(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(atomic, "_WINDOWS", True)
     with pytest.raises(OutputError, match="the characters :, which Windows does not allow"):
         check_output(tmp_path / "a.ply:b")
+
+
+@pytest.fixture
+def windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pretend that files behave as on Windows: read-only ones are not replaced or removed."""
+    monkeypatch.setattr(atomic, "_WINDOWS", True)
+    monkeypatch.setattr(atomic, "fcntl", None)
+    monkeypatch.setattr(atomic, "_WAITS", (0.0, 0.0))
+    monkeypatch.setattr(os, "access", lambda path, mode: bool(Path(path).stat().st_mode & 0o200))
+    for name in ("replace", "unlink"):
+        monkeypatch.setattr(os, name, checked(getattr(os, name)))
+
+
+def checked(change: Callable[..., None]) -> Callable[..., None]:
+    def act(*paths: Path, **options: int) -> None:
+        if any(path.exists() and not path.stat().st_mode & 0o200 for path in paths):
+            raise PermissionError(errno.EACCES, "Access is denied", str(paths[0]))
+        change(*paths, **options)
+
+    return act
+
+
+@pytest.mark.usefixtures("windows")
+def test_a_read_only_file_is_refused_on_windows_before_the_work(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    write(path, b"old")
+    path.chmod(0o444)
+    for act in (check_output, write):
+        with pytest.raises(OutputError, match="must be writable, found a read-only file"):
+            act(path, overwrite=True)
+    assert list(tmp_path.iterdir()) == [path]
+    path.chmod(0o644)
+    write(path, overwrite=True)
+    assert path.read_bytes() == b"new"
+
+
+@pytest.mark.usefixtures("windows")
+@pytest.mark.parametrize("times", [1, 2, 3])
+def test_a_file_that_a_scanner_holds_for_a_moment_is_replaced_on_windows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, times: int
+) -> None:
+    path, left, replace = tmp_path / "a.ply", [None] * times, os.replace
+    write(path, b"old")
+
+    def busy(source: Path, target: Path) -> None:
+        if left:
+            left.pop()
+            raise PermissionError(errno.EACCES, "Access is denied", str(source))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", busy)
+    if times > 2:
+        with pytest.raises(OutputError, match="must be writable, found: access is denied"):
+            write(path, overwrite=True)
+    else:
+        write(path, overwrite=True)
+    assert path.read_bytes() == (b"old" if times > 2 else b"new")
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.usefixtures("windows")
+def test_a_temporary_file_that_cannot_be_removed_is_no_error_on_windows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path) -> NoReturn:
+        raise PermissionError(errno.EACCES, "Access is denied", str(path))
+
+    monkeypatch.setattr(os, "unlink", refuse)
+    write(tmp_path / "a.ply")
+    assert (tmp_path / "a.ply").read_bytes() == b"new"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the maps of Linux")

@@ -38,6 +38,9 @@ _MOST_WRITERS = 16
 _OLD_SECONDS = 3600
 """Without locks, a temporary file that was not written to for this long is a leftover."""
 
+_WAITS = (0.05, 0.1, 0.2, 0.4, 0.8)
+"""Seconds to wait on Windows for programs that hold a file for a moment, such as virus scanners."""
+
 _DISK_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 
 
@@ -76,6 +79,10 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
             )
         if target.exists() and not overwrite:
             raise _exists(path)
+        if _WINDOWS and target.exists() and not os.access(target, os.W_OK):
+            raise OutputError(
+                f"{os.fspath(path)}: the output must be writable, found a read-only file."
+            )
         for folder in (target.parent, Path(path).parent):  # "missing/.." is not resolved by name
             if not folder.is_dir():
                 raise OutputError(
@@ -146,7 +153,8 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
         raise write_error(path, error) from error
     finally:
         if fcntl is None and temporary is not None:
-            temporary.unlink(missing_ok=True)
+            with suppress(OSError):  # another program holds it; a later run removes it
+                temporary.unlink(missing_ok=True)
 
 
 def make_folder(folder: str | os.PathLike[str], *, parents: bool = True) -> None:
@@ -236,9 +244,9 @@ def _target(path: str | os.PathLike[str]) -> Path:
 def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
     """Move the finished file to its name."""
     if overwrite:
-        if target.exists():
+        if target.exists() and not _WINDOWS:
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
-        temporary.replace(target)
+        replace_file(temporary, target)
         return
     for take in (_link, _rename):
         try:
@@ -249,6 +257,18 @@ def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
             continue
         return
     _claim(temporary, target)
+
+
+def replace_file(source: Path, target: Path) -> None:
+    """Move a file to a name; on Windows, wait for a moment if another program holds either file."""
+    for seconds in _WAITS if _WINDOWS else ():
+        try:
+            source.replace(target)
+        except PermissionError:
+            time.sleep(seconds)
+        else:
+            return
+    source.replace(target)
 
 
 def _link(temporary: Path, target: Path) -> None:

@@ -23,7 +23,7 @@ from cvtgs.devices import one_thread
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError, RunError
 from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output
-from cvtgs.io.atomic import write_error
+from cvtgs.io.atomic import replace_file, write_error
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.rows import AREA, VISIBILITY, record_type
 from cvtgs.outofcore.scan import (
@@ -279,7 +279,7 @@ def _adopt(job: Job, files: Iterable[SortedFile]) -> None:
                 f"{job.path(file.attempt)}: must have the {file.size} bytes that were "
                 f"written, found {found}; check the disk, and run the same command again."
             )
-        job.path(file.attempt).replace(job.path(file.name))
+        replace_file(job.path(file.attempt), job.path(file.name))
     for path in job.path("").glob("attempt_*"):
         path.unlink(missing_ok=True)
     facts = {file.name: (file.size, file.checksum) for file in adopted}

@@ -23,7 +23,7 @@ from cvtgs.errors import (
     reason_of,
 )
 from cvtgs.io import atomic_output, check_output
-from cvtgs.io.atomic import make_folder
+from cvtgs.io.atomic import make_folder, replace_file
 from cvtgs.io.limits import phrases
 from cvtgs.io.locks import hidden_path
 from cvtgs.progress import ProgressListener
@@ -242,7 +242,7 @@ def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
         for name in [*names, index]:
             if (place / name).is_dir():
                 _remove(place / name)
-            (hidden / name).replace(place / name)
+            replace_file(hidden / name, place / name)
         for name in old:  # left over from the replaced stream
             _remove(place / name)
     except OSError as error:
