@@ -69,6 +69,12 @@ def test_toml_round_trip(name, tmp_path):
     assert SimplifyConfig.from_toml(path) == config
 
 
+def test_a_byte_order_mark_before_toml_is_skipped(tmp_path):
+    path = tmp_path / "config.toml"
+    path.write_text('preset = "paper"\n', encoding="utf-8-sig")  # as Notepad may save it
+    assert SimplifyConfig.from_toml(path).preset == "paper"
+
+
 def test_a_partial_file_takes_the_rest_from_its_preset(tmp_path):
     path = tmp_path / "config.toml"
     path.write_text('preset = "paper"\n[merge]\ninflation = 0.5\n', encoding="utf-8")

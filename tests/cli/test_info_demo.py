@@ -1,5 +1,8 @@
 """``cvtgs info`` and ``cvtgs demo``."""
 
+import io
+import sys
+
 import pytest
 
 import cvtgs
@@ -101,6 +104,16 @@ def test_demo_writes_three_scenes_and_a_page_and_prints_next_steps(tmp_path, cap
         assert text in printed
     assert main([*words, "--quiet"]) == 0
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(("encoding", "rule"), [("utf-8", "\u2500"), ("cp1252", "-")])
+def test_the_table_of_the_demo_fits_the_encoding_of_the_output(monkeypatch, encoding, rule):
+    output = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(output, encoding=encoding))
+    demo._print_table([{"file": "full.ply", "size": "1 kB"}, {"file": "small.ply", "size": "1 B"}])
+    sys.stdout.flush()
+    lines = output.getvalue().decode(encoding).splitlines()
+    assert set(lines[2].strip()) == {rule}
 
 
 def test_demo_refuses_a_folder_that_cannot_be_created(tmp_path, capsys):

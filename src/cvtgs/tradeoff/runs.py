@@ -198,14 +198,19 @@ def pass_warnings_on(errors: str, warned: set[str]) -> None:
 def run_process(command: Sequence[str]) -> ProcessCost:
     r"""Run a command to its end and measure it.
 
-    If this call is interrupted, the process is terminated first.
+    If this call is interrupted, the process is terminated first. Lines of its output end with
+    ``\n``, and Python writes it as UTF-8, on Windows too.
     """
     launcher = [sys.executable, "-S", "-c", LAUNCHER, *command]
     reading, writing = os.pipe()
     with os.fdopen(writing, "wb") as held:
         with os.fdopen(reading, "rb") as watched:
             process = subprocess.Popen(
-                launcher, stdin=watched, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+                launcher,
+                stdin=watched,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                env={**os.environ, "PYTHONIOENCODING": "utf-8"},
             )
         with process:
             try:
@@ -214,7 +219,8 @@ def run_process(command: Sequence[str]) -> ProcessCost:
                 held.close()
                 process.communicate()
                 raise
-    output, errors = (part.decode(errors="replace") for part in written)
+    texts = (part.decode(errors="replace") for part in written)
+    output, errors = (text.replace("\r\n", "\n") for text in texts)
     output, _, line = output.rstrip("\n").rpartition("\n")
     try:
         code, user, wall, peak = (float(word) for word in line.split())
