@@ -2,14 +2,17 @@
 
 import io
 import json
+import shutil
 import sys
 import tempfile
 import threading
 import warnings
 import zipfile
 from collections import OrderedDict
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -23,7 +26,7 @@ from cvtgs.errors import (
     InvalidArgumentError,
     OutputError,
 )
-from cvtgs.io import losses
+from cvtgs.io import losses, to_dict
 from cvtgs.io.streams import file_of
 from format_cases import storable_scene
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
@@ -319,3 +322,27 @@ def test_warnings_that_are_caught_around_streams_can_be_shown_later(
     left_behind("shown", UserWarning, "file", 1)
     assert said == ["shown"]
     assert warnings.showwarning is own
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the maps of Linux")
+@pytest.mark.parametrize("is_damaged", [False, True])
+def test_no_copy_of_a_stream_is_mapped_when_it_is_removed(
+    monkeypatch: pytest.MonkeyPatch, is_damaged: bool
+) -> None:
+    """Windows does not remove mapped files."""
+    splats = to_dict(storable_scene(40, degree=0))
+    if is_damaged:
+        splats["scales"] = splats["scales"][1:].clone()
+    stream, seen, remove = io.BytesIO(), list[list[str]](), shutil.rmtree
+    torch.save({"splats": splats}, stream)
+    stream.seek(0)
+
+    def look(path: str, **options: Any) -> None:
+        maps = Path("/proc/self/maps").read_text(encoding="utf-8")
+        seen.append([line for line in maps.splitlines() if f"{path}/stream.pt" in line])
+        remove(path, **options)
+
+    monkeypatch.setattr(shutil, "rmtree", look)
+    with pytest.raises(FileFormatError) if is_damaged else nullcontext():
+        cvtgs.load(stream)
+    assert seen == [[]]

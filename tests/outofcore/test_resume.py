@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -209,6 +210,28 @@ def test_damaged_files_of_steps_are_made_again(source, tmp_path, kind):
     report = simplify_file(source, output, 0.05, blocks=8)
     assert report.resumed_blocks == {"small": 2, "targets": 0}.get(kind, 3)
     assert output.read_bytes() == whole.read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the maps of Linux")
+def test_damaged_files_are_not_mapped_when_they_are_removed(source, tmp_path, monkeypatch):
+    """Windows does not remove mapped files."""
+    output, seen, unlink = tmp_path / "out.ply", [], Path.unlink
+    with pytest.raises(StoppedError):
+        simplify_file(source, output, 0.05, blocks=8, listener=stop_in_blocks)
+    sent = next(path for path in tmp_path.glob(".out.ply.blocks/*/sent_*") if path.stat().st_size)
+    os.truncate(sent, sent.stat().st_size // 2)
+
+    def look(self, **options):
+        maps = Path("/proc/self/maps").read_text(encoding="utf-8")
+        seen.append((self.name, str(self) in maps))
+        unlink(self, **options)
+
+    monkeypatch.setattr(Path, "unlink", look)
+    simplify_file(source, output, 0.05, blocks=8)
+    labels = sent.name.replace("sent", "labels")
+    assert (labels, False) in seen
+    assert not [name for name, is_mapped in seen if is_mapped]
 
 
 def test_a_job_that_fails_before_it_can_resume_leaves_no_folder(source, tmp_path):

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import SpooledTemporaryFile, TemporaryDirectory
+from traceback import clear_frames
 from typing import Any, BinaryIO, ClassVar, Protocol, cast
 
 from cvtgs.errors import CvtgsError, FileFormatError, InputError, OutputError, reason_of
@@ -57,7 +58,8 @@ def file_of(
     name = name or name_of(stream)
     with ExitStack() as stack:
         try:
-            folder = stack.enter_context(TemporaryDirectory(prefix="cvtgs-"))
+            temporary = TemporaryDirectory(prefix="cvtgs-", ignore_cleanup_errors=True)
+            folder = stack.enter_context(temporary)
             path = Path(folder) / "stream"
             with path.open("xb") as file:
                 for chunk in _chunks(stream, name):
@@ -82,10 +84,19 @@ def file_of(
         try:
             yield path
         except CvtgsError as error:
+            _free_frames(error)
             text = str(error)
             if folder not in text:
                 raise
             raise type(error)(_renamed(text, path, name)) from error
+
+
+def _free_frames(error: BaseException) -> None:
+    """Free what the finished calls of an error hold: Windows does not remove mapped files."""
+    part: BaseException | None = error
+    while part is not None:
+        clear_frames(part.__traceback__)
+        part = part.__cause__ or part.__context__
 
 
 @contextmanager

@@ -315,7 +315,7 @@ class Job:
         for kind in STEPS:
             for path in self.path("").glob(f"{kind}_*"):
                 try:
-                    _, facts = map_tensors(path)
+                    facts = map_tensors(path)[1]  # Windows does not remove mapped files
                     whole = True
                     if SENT_BYTES in facts:
                         block = int(path.name.removeprefix("labels_"))
