@@ -50,6 +50,16 @@ def test_evaluate_prints_a_row_per_scene(scenes, capsys):
     assert "LPIPS" in printed
 
 
+def test_patterns_are_expanded_where_the_shell_does_not(folder, capsys):
+    """As on Windows."""
+    words = ["evaluate", str(folder / "full.ply"), str(folder / "0.*.ply")]
+    assert main([*words, *SMALL, "--lpips", "off", "--json"]) == 0
+    found = Evaluation.model_validate_json(capsys.readouterr().out)
+    assert [scores.name for scores in found.scenes] == ["0.01.ply", "0.1.ply"]
+    assert main([*words[:2], str(folder / "no*.ply"), *SMALL]) == 1
+    assert "the pattern must match a file, found none" in capsys.readouterr().err
+
+
 def test_the_note_on_missing_lpips_weights_is_wrapped(scenes, tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("CVTGS_LPIPS_WEIGHTS", raising=False)
     monkeypatch.setattr(sys.modules["cvtgs.evaluation.lpips"], "find_spec", lambda name: None)

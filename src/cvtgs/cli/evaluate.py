@@ -17,6 +17,7 @@ from cvtgs.cli.cameras import (
     read_photographs,
 )
 from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
+from cvtgs.cli.jobs import expanded
 from cvtgs.cli.options import (
     AddParser,
     add_options,
@@ -116,7 +117,7 @@ def _read_scenes(options: argparse.Namespace) -> _Scenes:
     """Read REF and every SMALL; name them after their files."""
     from cvtgs.devices import chosen_device
 
-    paths = [options.reference, *options.small]
+    paths = [options.reference, *expanded(options.small)]
     names = [printable(path.name) for path in paths]
     names = [
         name if names.count(name) == 1 else printable(str(path))

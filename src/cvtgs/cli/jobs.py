@@ -4,7 +4,7 @@ import argparse
 import glob
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -264,10 +264,19 @@ def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
     ]
 
 
+def expanded(patterns: Iterable[Path]) -> list[Path]:
+    """Expand patterns that the shell left unexpanded, as those of Windows do."""
+    return [Path(path) for pattern in patterns for path in _matches(str(pattern))]
+
+
 def _expanded(pattern: str) -> list[str]:
-    """Expand a pattern that the shell left unexpanded, or a folder of scenes."""
+    """Expand a pattern, or a folder of scenes."""
     if os.path.isdir(pattern):  # noqa: PTH112 (any path)
         return _in_folder(pattern)
+    return _matches(pattern)
+
+
+def _matches(pattern: str) -> list[str]:
     if os.path.lexists(pattern) or not glob.has_magic(pattern):
         return [pattern]
     found = sorted(glob.glob(pattern, recursive=True))  # noqa: PTH207 (any path, any pattern)

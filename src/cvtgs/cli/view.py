@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.display import say
+from cvtgs.cli.jobs import expanded
 from cvtgs.cli.options import PRESET_NAMES, AddParser, add_options, ratio
 from cvtgs.errors import InvalidArgumentError
 
@@ -93,9 +94,10 @@ def view(options: argparse.Namespace) -> None:
         raise InvalidArgumentError(f"--port must be from 1 to 65535, found {options.port}.")
     if options.page is not None:
         cvtgs.io.check_output(options.page, options.overwrite)
-    names = [options.input, *options.small]
+    small = expanded(options.small)
+    names = [options.input, *small]
     scene, *others = (cvtgs.load(path, trust_sizes=options.trust_sizes) for path in names)
-    named = {str(path): other for path, other in zip(options.small, others, strict=True)}
+    named = {str(path): other for path, other in zip(small, others, strict=True)}
     viewer = SceneViewer(scene, named, device=options.device)
     server = ViewerServer(
         viewer, host=options.host, port=options.port, preset=preset, rho=options.rho
