@@ -1,6 +1,7 @@
 """Chunks and shares of streams by hand."""
 
 import json
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -47,6 +48,21 @@ def test_parts_of_about_equally_many_fine_gaussians():
     chunks = planned(fine, coarse, most=9).chunks
     assert [own.rows[1].tolist() for own in chunks] == [[0, 1, 2], [3]]
     assert [len(own.rows[0]) for own in chunks] == [3, 9]
+
+
+def test_gaussians_that_the_coarsest_level_left_out_take_no_quadratic_time():
+    """Comparing all of them with all of the coarsest takes 3 s; half of a hazy scene may be so."""
+    places, owners = torch.rand(20_000, generator=torch.Generator().manual_seed(0)), range(20_000)
+    fine = level(places.tolist(), None)
+    seconds = []
+    for left_out in (0, 15_000):
+        kept = [-1 if row < left_out else row % 5_000 for row in owners]
+        coarse = level(places[-5_000:].tolist(), kept)
+        start = time.process_time()
+        chunks = planned(fine, coarse, most=5_000).chunks
+        seconds.append(time.process_time() - start)
+        assert sum(len(chunk.rows[0]) for chunk in chunks) == 20_000
+    assert seconds[1] < seconds[0] + 0.5
 
 
 def test_a_box_reaches_three_deviations_along_every_axis():

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.boxes import Corner
+from cvtgs.cvt import nearest_scipy
 from cvtgs.devices import on_host
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.arrays import morton_rows
@@ -219,9 +220,9 @@ def _parents(level: StreamedLevel, coarsest: StreamedLevel) -> Int[Tensor, "m"]:
     parents = torch.full((count,), -1)
     parents[pairs[order] // wide] = pairs[order] % wide
     missing = (parents < 0).nonzero()[:, 0]  # the coarsest level left out all of their rows
-    means, sites = level.scene.means.double().cpu(), coarsest.scene.means.double().cpu()
-    for rows in missing.split(1 << 10):
-        parents[rows] = torch.cdist(means[rows], sites).argmin(dim=1)
+    if len(missing):
+        means, sites = level.scene.means.cpu(), coarsest.scene.means.cpu()
+        parents[missing], _ = nearest_scipy(means[missing], sites)
     return parents
 
 
