@@ -133,3 +133,14 @@ def test_an_unknown_suffix_of_levels_is_named(tmp_path, capsys):
     line = ["levels", str(tmp_path / "a.ply"), "-o", str(tmp_path / "out"), "--suffix", "xyz"]
     assert main(line) == 1
     assert "--suffix must end in .compressed.ply, " in capsys.readouterr().err
+
+
+def test_cameras_beside_the_scene_are_read_only_if_levels_use_images(
+    tmp_path: Path, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "transforms.json").write_text("{")
+    assert main([*words, "--rho", "0.1", "--no-scores"]) == 0
+    assert "cameras are not used" not in capsys.readouterr().err
+    scored = ["--rho", "0.1", "--overwrite", "--views", "1", "--size", "32"]
+    assert main([*words, *scored]) == 0
+    assert capsys.readouterr().err.count("cameras are not used") == 1

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
 import cvtgs
 from cvtgs.cli.main import main
@@ -272,6 +273,13 @@ def test_simplify_uses_the_preset_of_its_checkpoint(made, tmp_path, lively):
         report, _ = simplified(made, tmp_path, *words)
         assert report["config"]["preset"] == preset
         assert report["checkpoint"] == (words[1] if "--ckpt" in words else preset)
+
+
+def test_levels_use_the_preset_of_their_checkpoint(made, tmp_path):
+    _, small = simplified(made, tmp_path, "--ckpt", "paper")
+    line = ["levels", str(made / "scenes" / "exam.ply"), "-o", str(tmp_path), "--ckpt", "paper"]
+    assert main([*line, "--rho", "0.1", "--no-scores", "--quiet"]) == 0
+    assert torch.equal(cvtgs.load(tmp_path / "rho_0.1.ply").means, small.means)
 
 
 def test_simplify_without_a_network(made, tmp_path):

@@ -16,7 +16,9 @@ from cvtgs.cli.jobs import check_suffix
 from cvtgs.cli.options import (
     AddParser,
     add_options,
+    checkpoint_of,
     dotted,
+    preset_of,
     read_axes,
     read_ratios,
     read_settings,
@@ -86,9 +88,9 @@ def levels(options: argparse.Namespace) -> None:
     if options.stream is None:
         cvtgs.levels.check_levels(options.output, names, overwrite=options.overwrite)
     config = cvtgs.SimplifyConfig.compose(
-        file=options.config, preset=options.preset, settings=read_settings(options.settings)
+        file=options.config, preset=preset_of(options), settings=read_settings(options.settings)
     )
-    checkpoint = None if options.ckpt == "none" else options.ckpt
+    checkpoint = checkpoint_of(options)
     if options.stream is not None and stream_blocks(options, checkpoint, config, rhos, axes):
         return
     with progress_bars(quiet=options.quiet) as listener:
@@ -101,7 +103,7 @@ def levels(options: argparse.Namespace) -> None:
         cameras = None
         if options.cameras is not None:  # scores are by the split, so levels do not learn from it
             cameras = cvtgs.load_cameras(options.cameras, split=options.split and "train")
-        if cameras is None and axes.source is None:
+        if cameras is None and axes.source is None and config.uses_images:
             own = cvtgs.views.find_own_cameras(scene, options.input)
             cameras = None if own is None else own.cameras
         made = simplifier.levels(scene, rhos, cameras=cameras)

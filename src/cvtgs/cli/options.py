@@ -311,6 +311,19 @@ def _setting_names(section: "type[pydantic.BaseModel]", prefix: str = "") -> Ite
             yield prefix + name
 
 
+def checkpoint_of(options: argparse.Namespace) -> str | None:
+    """Return ``--ckpt``; None for no network."""
+    return None if options.ckpt == "none" else options.ckpt
+
+
+def preset_of(options: argparse.Namespace) -> str | None:
+    """Return ``--preset``; without it and ``--config``, the preset of ``--ckpt``."""
+    preset: str | None = options.preset
+    if preset is None and options.config is None and options.ckpt not in ("auto", "none"):
+        preset = cvtgs.mergenet.load_checkpoint(options.ckpt).info.preset
+    return preset
+
+
 def read_scene(
     options: argparse.Namespace, config: "SimplifyConfig", *, axes: str | None = None
 ) -> "GaussianScene":

@@ -17,7 +17,9 @@ from cvtgs.cli.options import (
     AddParser,
     add_options,
     check_written_files,
+    checkpoint_of,
     count,
+    preset_of,
     ratio,
     read_axes,
     read_scene,
@@ -141,12 +143,11 @@ def simplify(options: argparse.Namespace) -> None:
     read_axes(options.axes)
     check_split(options)
     check_goals(options)
-    checkpoint = None if options.ckpt == "none" else options.ckpt
-    preset = options.preset
-    if checkpoint not in (None, "auto") and preset is None and options.config is None:
-        preset = cvtgs.mergenet.load_checkpoint(checkpoint).info.preset
+    checkpoint = checkpoint_of(options)
     settings = _refine_settings(options) | read_settings(options.settings, options.effects)
-    config = cvtgs.SimplifyConfig.compose(file=options.config, preset=preset, settings=settings)
+    config = cvtgs.SimplifyConfig.compose(
+        file=options.config, preset=preset_of(options), settings=settings
+    )
     if options.rho is not None:
         cvtgs.target_count(1, options.rho)
     with open_jobs(options) as jobs:

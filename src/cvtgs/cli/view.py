@@ -53,7 +53,11 @@ def add_view(add_parser: AddParser) -> None:
         "--host", default=HOST, help=f"address to listen on (default {HOST}: this machine only)"
     )
     parser.add_argument(
-        "--port", type=int, metavar="N", default=PORT, help=f"port to listen on (default {PORT})"
+        "--port",
+        type=int,
+        metavar="N",
+        default=PORT,
+        help=f"port to listen on; if it is taken, the next free one (default {PORT})",
     )
     parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
     add_options(parser, "--device", "--trust-sizes", "--overwrite", "--quiet")
