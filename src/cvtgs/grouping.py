@@ -30,22 +30,6 @@ FULL_RELIEF = 0.1
 """Ratio of cells to Gaussians from which on ``allocation.far_relief`` applies unchanged."""
 
 
-class Grouping(NamedTuple):
-    """The cells, and the quality of the tessellation.
-
-    Attributes:
-        partition: Rows of the scene that make up every cell.
-        refilled: Number of cells that were empty after Lloyd and took a Gaussian from another.
-        energies: Energy before every Lloyd iteration, over the Gaussians that Lloyd samples.
-        energy: Energy of the final cells, over all Gaussians.
-    """
-
-    partition: cells.Partition
-    refilled: int
-    energies: tuple[float, ...]
-    energy: float
-
-
 class WeightedRows(NamedTuple):
     """Gaussians to group, in the order of the Morton curve.
 
@@ -202,27 +186,19 @@ def allocate(
     return cells.reassign(members, labels, cells.Moments(*moments), near, config)
 
 
-def collect_cells(
-    points: WeightedRows, labels: Int[Tensor, "k"], target: int, tessellation: cvt.Tessellation
-) -> Grouping:
+def collect_cells(points: WeightedRows, labels: Int[Tensor, "k"], target: int) -> cells.Partition:
     """Collect the Gaussians of the full scene that make up every cell.
 
     Args:
         points: The Gaussians that were grouped.
         labels: Their cells, none empty.
         target: Number of cells.
-        tessellation: The tessellation, for its statistics.
 
     Returns:
-        The cells.
+        Rows of the scene that make up every cell.
     """
     local = cells.Partition.from_labels(labels, target)
-    return Grouping(
-        partition=replace(local, order=points.rows.index_select(0, local.order)),
-        refilled=tessellation.refilled,
-        energies=tessellation.energies,
-        energy=tessellation.energy,
-    )
+    return replace(local, order=points.rows.index_select(0, local.order))
 
 
 def row_moments(

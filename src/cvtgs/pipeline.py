@@ -22,7 +22,6 @@ from cvtgs.config import MergeConfig, SimplifyConfig
 from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
 from cvtgs.grouping import (
-    Grouping,
     OrderedRows,
     allocate,
     collect_cells,
@@ -71,13 +70,13 @@ class Reduced(NamedTuple):
     Attributes:
         scene: The small scene.
         statistics: Statistics of the filter and the cells, for the report.
-        grouping: The cells; None if all Gaussians are kept.
+        partition: Rows of the scene that make up every cell; None if all Gaussians are kept.
         matching: Report of the matching to images; None if there was none.
     """
 
     scene: GaussianScene
     statistics: CellStatistics = CellStatistics()
-    grouping: Grouping | None = None
+    partition: cells.Partition | None = None
     matching: MatchReport | None = None
 
 
@@ -121,12 +120,13 @@ def reduce_scene(
         tessellation = tessellate_rows(points, analysis, target, config, on_iteration=advance)
     with clock.stage("allocate"):
         labels = allocate(points, tessellation, analysis, target, config.allocation)
-        grouping = collect_cells(points, labels, target, tessellation)
+        partition = collect_cells(points, labels, target)
+    refilled, energies, energy = tessellation.refilled, tessellation.energies, tessellation.energy
     del points, labels, tessellation
     with clock.stage("merge", target) as advance:
         merged = merge_and_inflate(
             used,
-            grouping.partition,
+            partition,
             config.merge,
             areas=analysis.areas,
             with_network=net is not None and net.sees_surroundings,
@@ -150,13 +150,13 @@ def reduce_scene(
         filtered_count=left_out,
         filtered_mass_share=left_out_mass_share,
         single_member_cells=merged.partition.count_singles(),
-        largest_cell=int(grouping.partition.counts.amax()),
-        refilled_cells=grouping.refilled,
-        energies=grouping.energies,
-        energy=grouping.energy,
+        largest_cell=int(partition.counts.amax()),
+        refilled_cells=refilled,
+        energies=energies,
+        energy=energy,
         backend=cvt.SEARCH,
     )
-    return Reduced(small, statistics, grouping)
+    return Reduced(small, statistics, partition)
 
 
 def merge_and_inflate(
@@ -235,10 +235,10 @@ def level_facts(
 
     ``is_valid`` says which input rows the scene has; None if it has all of them.
     """
-    if reduced.grouping is None:
+    partition = reduced.partition
+    if partition is None:
         kept = torch.arange(len(scene), dtype=torch.int32, device=scene.device)
         return 0.0, None if is_valid is None else _of_input(kept, is_valid)
-    partition = reduced.grouping.partition
     masses = analysis.apparent_areas * analysis.opacities
     error = geometric_error(scene, reduced.scene, partition, masses=masses)
     return error, _of_input(partition.labels(len(scene)), is_valid)

@@ -282,14 +282,12 @@ class Prepared:
 
     def _match(self, reduced: Reduced, analysis: SceneAnalysis, clock: StageClock) -> Reduced:
         """Match the small scene to the images of the analysis, if there are any."""
-        if reduced.grouping is None or analysis.observed is None:
+        if reduced.partition is None or analysis.observed is None:
             return reduced
         from cvtgs.matching import cell_contributions, match_views  # noqa: PLC0415 (few need it)
 
         with clock.stage("match"):
-            targets = cell_contributions(
-                analysis.observed.contributions, reduced.grouping.partition
-            )
+            targets = cell_contributions(analysis.observed.contributions, reduced.partition)
             small = drop_unused_bands(reduced.scene, analysis.plan)
             kept = len(small) - len(targets)  # protected Gaussians come first, and have no cells
             matched = match_views(

@@ -68,7 +68,7 @@ def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> Me
     points = weigh_rows(valid, rows, analysis, config)
     tessellation = tessellate_rows(points, analysis, target, config)
     labels = allocate(points, tessellation, analysis, target, config.allocation)
-    partition = collect_cells(points, labels, target, tessellation).partition
+    partition = collect_cells(points, labels, target)
     merged = merge_and_inflate(
         valid, partition, config.merge, areas=analysis.areas, with_network=True
     )
