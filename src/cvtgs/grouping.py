@@ -37,7 +37,7 @@ class WeightedRows(NamedTuple):
         scene: The Gaussians.
         rows: ``(k,)`` rows of the scene.
         weights: ``(k,)`` weights in the tessellation.
-        masses: ``(k,)`` weights in the moments of a cell.
+        masses: ``(k,)`` masses, the weights in the moments of a cell.
         apparent_masses: ``(k,)`` apparent masses, which scale the costs of merging.
         moments: Moments of each Gaussian; None if not computed yet.
         neighbors: Gaussians that each may merge with; None if not computed yet.
@@ -212,8 +212,8 @@ def row_moments(
         points.scene,
         points.rows,
         analysis.frame,
-        weights=points.masses,
-        masses=points.apparent_masses,
+        masses=points.masses,
+        apparent_masses=points.apparent_masses,
         components=components,
     )
 

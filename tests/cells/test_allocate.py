@@ -56,8 +56,8 @@ def scene_moments(scene):
         scene,
         rows,
         analysis.frame,
-        weights=scene.masses,
-        masses=analysis.apparent_areas * scene.opacities,
+        masses=scene.masses,
+        apparent_masses=analysis.apparent_areas * scene.opacities,
     )
 
 
@@ -92,7 +92,7 @@ def test_unlike_colours_stay_apart():
 def test_a_pair_that_images_hardly_show_merges_first():
     """The pair on the right lies a little farther apart, and is hardly seen."""
     moments = points([0.0, 1.0, 9.0, 10.1])
-    moments = moments._replace(masses=torch.tensor([1.0, 1.0, 1e-4, 1e-4]).double())
+    moments = moments._replace(apparent_masses=torch.tensor([1.0, 1.0, 1e-4, 1e-4]).double())
     assert merge_pairs(moments, all_others(4), 3, DEFAULT).tolist() == [0, 1, 2, 2]
     equal = AllocationConfig(mass_power=0.0)
     assert merge_pairs(moments, all_others(4), 3, equal).tolist() == [0, 0, 1, 2]
@@ -137,7 +137,9 @@ def test_a_giant_changes_no_costs_of_others(size):
 
     def labels_of_others():
         masses, frame = factors * scene.masses, analyze(scene, SimplifyConfig()).frame
-        moments = gaussian_moments(scene, torch.arange(300), frame, weights=masses, masses=masses)
+        moments = gaussian_moments(
+            scene, torch.arange(300), frame, masses=masses, apparent_masses=masses
+        )
         return merge_pairs(Moments(*(values[..., 1:] for values in moments)), near, 60, DEFAULT)
 
     alone = labels_of_others()
@@ -225,7 +227,7 @@ def test_moments_of_groups_equal_those_of_the_merge():
     """Two passes about the mean keep precision far from the origin, too."""
     members = points([100.0, 100.5, 300.0], weights=[1.0, 3.0, 2.0], size=0.1)
     groups = group_moments(members, torch.tensor([0, 0, 1]), 2)
-    assert groups.weights.tolist() == [4.0, 2.0]
+    assert groups.masses.tolist() == [4.0, 2.0]
     assert groups.means[0].tolist() == pytest.approx([100.375, 300.0])
     spread = 0.01 + 0.25 * 0.75 * 0.25
     assert groups.covariances[0].tolist() == pytest.approx([spread, 0.01])
@@ -266,7 +268,7 @@ def test_moving_members_lowers_the_divergence(kind):
     found = reassign(members, labels, groups, near, DEFAULT)
     assert 0 < int((found != labels).sum()) < 1800
     before, after = divergence(members, labels, 200), divergence(members, found, 200)
-    assert float((members.weights * after).sum()) < float((members.weights * before).sum())
+    assert float((members.masses * after).sum()) < float((members.masses * before).sum())
 
 
 def test_merged_cells_lose_less_than_those_of_the_tessellation():
@@ -371,7 +373,7 @@ def test_far_mass_lowers_the_power_of_masses(monkeypatch):
     config = AllocationConfig(mass_power=1.0, far_relief=0.5, widest=0.6)
     for place, mass in ((2.9, 1.0), (3.1, 1.0), (3.1, 7.0), (3.1, 0.0)):
         moments = points([0.0, 0.1, place])
-        moments = moments._replace(masses=torch.tensor([0.5, 0.5, mass]).double())
+        moments = moments._replace(apparent_masses=torch.tensor([0.5, 0.5, mass]).double())
         merge_pairs(moments, all_others(3), 2, config)
     wanted = [(0.3, 0.0), (0.3 * 0.75, 0.6), (0.3 * (1 - 0.5 * 0.875), 0.6), (0.3, 0.0)]
     assert seen == [pytest.approx(pair) for pair in wanted]

@@ -127,8 +127,8 @@ def test_pairs_with_like_view_dependent_colours_merge_first(weight, together):
         three,
         torch.arange(3),
         analyze(three, SimplifyConfig()).frame,
-        weights=torch.ones(3),
         masses=torch.ones(3),
+        apparent_masses=torch.ones(3),
         components=components,
     )
     others = torch.tensor([[1, 2], [0, 2], [0, 1]])

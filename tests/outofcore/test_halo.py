@@ -213,8 +213,8 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
         scene,
         torch.arange(len(scene)),
         job.read_scan().frame,
-        weights=scene.masses,
-        masses=torch.cat(areas) * scene.opacities,
+        masses=scene.masses,
+        apparent_masses=torch.cat(areas) * scene.opacities,
         components=job.read_scan().view_components,
     )
     config = allocation_at(TARGET / COUNT, job.config.allocation)
@@ -231,7 +231,7 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
     # Every group keeps a Gaussian of the block with its heaviest cell; else all is as in one piece.
     blocks = torch.repeat_interleave(torch.arange(BLOCKS), torch.tensor(job.cells))
     heaviest = torch.stack([
-        of_group[whole.weights[of_group].argmax()]
+        of_group[whole.masses[of_group].argmax()]
         for of_group in ((merged == group).nonzero()[:, 0] for group in range(TARGET))
     ])  # fmt: skip
     near = cvt.nearest_neighbors(wanted.means.T, REASSIGN)

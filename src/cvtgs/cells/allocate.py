@@ -74,7 +74,7 @@ def merge_pairs(
         The new group of every group, 0 to ``count - 1``.
     """
     contrast = _relative_contrast(groups.colors, neighbors)
-    far = float(far_share(torch.linalg.vector_norm(groups.means, dim=0), groups.masses))
+    far = float(far_share(torch.linalg.vector_norm(groups.means, dim=0), groups.apparent_masses))
     update = {
         "color": config.color / contrast,
         "mass_power": config.mass_power * contrast * (1.0 - config.far_relief * far),
@@ -82,7 +82,7 @@ def merge_pairs(
     }
     config = config.model_copy(update=update)
     table = torch.cat([torch.atleast_2d(values).float() for values in groups])  # fast to gather
-    total, labels = len(groups.weights), np.arange(len(groups.weights))
+    total, labels = len(groups.masses), np.arange(len(groups.masses))
     pairs = _distinct_pairs(labels.repeat(neighbors.shape[1]), neighbors.numpy().ravel())
     while total > count:
         if len(pairs) == 0:  # no neighbouring pairs are left: merge arbitrary ones
@@ -146,7 +146,7 @@ def _pair_costs(
     def costs_of(part: slice) -> Tensor:
         i, j = first[part], second[part]
         one, two = _take(table, i), _take(table, j)
-        share = one.weights / (one.weights + two.weights)
+        share = one.masses / (one.masses + two.masses)
         own = share * volumes.index_select(0, i) + (1.0 - share) * volumes.index_select(0, j)
         joint = _joint_covariances(one, two, share)
         cost = 0.5 * (_log_volume(joint) - own)
@@ -155,7 +155,7 @@ def _pair_costs(
         cost += config.color * share * (1.0 - share) * squares
         if config.widest:
             cost *= _fog_factor(joint, torch.lerp(two.means, one.means, share), config.widest)
-        cost *= (one.masses + two.masses) ** config.mass_power
+        cost *= (one.apparent_masses + two.apparent_masses) ** config.mass_power
         cost *= one.counts + two.counts
         return cost[0].nan_to_num_(torch.inf, torch.inf).clamp_min_(0.0)
 
@@ -179,7 +179,7 @@ def _fog_factor(
 def _joint_covariances(
     one: Moments, two: Moments, share: Float[Tensor, "1 n"]
 ) -> Float[Tensor, "6 n"]:
-    """Return the covariances of pairs, given the share of the first group in the weight."""
+    """Return the covariances of pairs, given the share of the first group in the mass."""
     rest, shifts = 1.0 - share, one.means - two.means
     spread = share * rest * shifts
     return torch.cat([
@@ -194,12 +194,12 @@ def _join_pairs(table: Float[Tensor, "c n"], kept: Rows, merged: Rows) -> None:
 
     def join(part: slice) -> None:
         one, two = _take(table, first[part]), _take(table, second[part])
-        weights = one.weights + two.weights
-        share = one.weights / weights
+        masses = one.masses + two.masses
+        share = one.masses / masses
         both = Moments(
             counts=one.counts + two.counts,
-            weights=weights,
-            masses=one.masses + two.masses,
+            masses=masses,
+            apparent_masses=one.apparent_masses + two.apparent_masses,
             means=torch.lerp(two.means, one.means, share),
             covariances=_joint_covariances(one, two, share),
             colors=torch.lerp(two.colors, one.colors, share),
@@ -284,7 +284,7 @@ def reassign(
     Returns:
         The new group of every member.
     """
-    count = len(groups.weights)
+    count = len(groups.masses)
     own = torch.arange(count, device=labels.device)
     candidates = torch.cat([own[None], neighbors.T]).contiguous()
     inverse, volumes = _inverse(groups.covariances)

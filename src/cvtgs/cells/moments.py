@@ -35,7 +35,7 @@ MOST_MEDIANS = 1e6
 """Largest unit of masses, in medians: a few giants must not make all others 0 in float32."""
 
 LARGEST_MASS = 1e30
-"""Limit of weights and masses, in this unit, so that sums are finite in float32."""
+"""Limit of masses, in this unit, so that sums are finite in float32."""
 
 SAMPLED_PAIRS = 1 << 14
 """Approximate number of pairs of neighbours in which components are sought."""
@@ -46,8 +46,9 @@ class Moments(NamedTuple):
 
     Attributes:
         counts: ``(n,)`` number of Gaussians.
-        weights: ``(n,)`` weights in the moments of a group: the masses.
-        masses: ``(n,)`` masses as seen in images, mean 1 over all Gaussians but for giants.
+        masses: ``(n,)`` masses, the weights in the moments of a group.
+        apparent_masses: ``(n,)`` masses as seen in images, mean 1 over all Gaussians but for
+            giants.
         means: ``(3, n)`` positions, robust radii from the centre of the scene.
         covariances: ``(6, n)`` upper triangles, squared robust radii.
         colors: ``(3, n)`` RGB of the constant band.
@@ -55,8 +56,8 @@ class Moments(NamedTuple):
     """
 
     counts: Float[Tensor, "n"]
-    weights: Float[Tensor, "n"]
     masses: Float[Tensor, "n"]
+    apparent_masses: Float[Tensor, "n"]
     means: Float[Tensor, "3 n"]
     covariances: Float[Tensor, "6 n"]
     colors: Float[Tensor, "3 n"]
@@ -68,8 +69,8 @@ def gaussian_moments(
     rows: Int[Tensor, "n"],
     frame: RobustFrame,
     *,
-    weights: Float[Tensor, "n"],
     masses: Float[Tensor, "n"],
+    apparent_masses: Float[Tensor, "n"],
     components: Float[Tensor, "c k"] | None = None,
     unit: float | None = None,
 ) -> Moments:
@@ -79,10 +80,10 @@ def gaussian_moments(
         scene: The Gaussians.
         rows: Row numbers of the Gaussians to use.
         frame: Centre and radius of the scene; the radius is the unit of length.
-        weights: Mass of each.
-        masses: Mass of each as seen in images.
+        masses: Mass of each.
+        apparent_masses: Mass of each as seen in images.
         components: Result of :func:`view_components`; None for no view-dependent colour.
-        unit: Divisor of weights and masses; None divides each by its own
+        unit: Divisor of both masses; None divides each by its own
             :func:`cvtgs.cells.mass_unit`.
 
     Returns:
@@ -110,15 +111,15 @@ def gaussian_moments(
 
     in_chunks(moments_of, count, CHUNK, device)  # a few columns of a chunk fit into a cache
     tiny = torch.finfo(torch.float64).tiny
-    weights, masses = weights.double(), masses.double()
+    masses, apparent_masses = masses.double(), apparent_masses.double()
     units = [
         mass_unit(values, values.mean()) if unit is None else values.new_tensor(unit)
-        for values in (weights, masses)
+        for values in (masses, apparent_masses)
     ]
     return Moments(
-        counts=torch.ones_like(weights),
-        weights=(weights / units[0].clamp_min(tiny)).clamp(1e-12, LARGEST_MASS),
-        masses=(masses / units[1].clamp_min(tiny)).clamp_max(LARGEST_MASS),
+        counts=torch.ones_like(masses),
+        masses=(masses / units[0].clamp_min(tiny)).clamp(1e-12, LARGEST_MASS),
+        apparent_masses=(apparent_masses / units[1].clamp_min(tiny)).clamp_max(LARGEST_MASS),
         means=means,
         covariances=covariances,
         colors=colors,
@@ -157,9 +158,9 @@ def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Mom
     Returns:
         Moments of the groups.
     """
-    columns = [members.counts, members.weights, members.masses]
-    counts, weights, masses = label_sums(columns, labels, count)
-    shares = members.weights / weights.index_select(0, labels)
+    columns = [members.counts, members.masses, members.apparent_masses]
+    counts, masses, apparent_masses = label_sums(columns, labels, count)
+    shares = members.masses / masses.index_select(0, labels)
     columns = [*members.means, *members.colors, *members.view_colors]
     sums = label_sums(columns, labels, count, shares)
     means, colors, varying = sums[:3], sums[3:6], sums[6:]
@@ -169,7 +170,7 @@ def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Mom
     for product, (i, j) in zip(products, UPPER, strict=True):
         torch.mul(shifts[i], shifts[j], out=product)
     covariances = label_sums(products.add_(members.covariances), labels, count, shares)
-    return Moments(counts, weights, masses, means, covariances, colors, varying)
+    return Moments(counts, masses, apparent_masses, means, covariances, colors, varying)
 
 
 @one_thread()

@@ -51,8 +51,8 @@ def _members(job: Job, rows: BlockRows, components: Tensor | None = None) -> Mom
         scene,
         torch.arange(len(scene)),
         scan.frame,
-        weights=scene.masses,
-        masses=rows.apparent_areas * scene.opacities,
+        masses=scene.masses,
+        apparent_masses=rows.apparent_areas * scene.opacities,
         components=components,
         unit=scan.mass_unit,
     )
@@ -109,7 +109,7 @@ def _cell_counts(job: Job) -> list[int]:
 
 def _own_count(parts: Mapping[str, Tensor]) -> int:
     """Return how many of the parts in a block belong to its own cells."""
-    return len(parts["weights"]) - len(parts["remote"])
+    return len(parts["masses"]) - len(parts["remote"])
 
 
 def _allocate_region(
@@ -119,12 +119,12 @@ def _allocate_region(
     config = _costs(job)
     sizes = torch.tensor(cell_counts)[list(region)]
     fine = _add_parts(job, region, cell_counts)
-    labels = torch.arange(len(fine.weights))
+    labels = torch.arange(len(fine.masses))
     if len(labels) > count:
         near = cvt.nearest_neighbors(fine.means.T, config.neighbors)
         labels = cells.merge_pairs(fine, near, count, config)
     order, offsets = sort_by_label(labels, count)
-    heaviest = order[segment_argmax(fine.weights[order], offsets)]
+    heaviest = order[segment_argmax(fine.masses[order], offsets)]
     owners = torch.repeat_interleave(torch.arange(len(region)), sizes)[heaviest]
     owners, order = torch.sort(owners, stable=True)
     ranks = torch.empty_like(order)
