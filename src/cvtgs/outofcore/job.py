@@ -30,7 +30,7 @@ SENT_BYTES = "sent_bytes"
 """Entry of the label file of a block: bytes of the file of its sent rows."""
 
 
-FILES_VERSION = 3
+FILES_VERSION = 4
 """Number of the layout of these files: raise it with every change, so that no run continues with
 files of another layout."""
 

@@ -217,8 +217,9 @@ def _embedded_rows(job: Job, block: int, order: Tensor | None = None) -> Embedde
         order = curve_order(scene, everything, scan.frame, masses=masses).int()
     rows = order.long()
     points = embed_rows(scene, rows, analysis, job.read_manifest().total, job.config)
-    weights = gaussian_weights(analysis.opacities[rows], areas[rows], scan.area_power)
-    weights = (weights / scan.mean_weight).clamp_min(job.config.cvt.weight_floor)
+    config = job.config.cvt
+    weights = gaussian_weights(analysis.opacities[rows], areas[rows], config.area_power)
+    weights = (weights / scan.mean_weight).clamp_min(config.weight_floor)
     return EmbeddedRows(order, points, weights)
 
 

@@ -177,9 +177,7 @@ class SceneScan:
         max_flyaway_mass: The filter leaves out flyaways whose mass, times the perspective falloff,
             is at most this; -1 leaves out none.
         mean_weight: Mean weight in the tessellation, before the floor.
-        min_weight: The floor of the weights.
         cell_weight: Weight of one cell; heavier Gaussians count as one cell. 0 if all count as one.
-        area_power: Power of the area in the weight.
         partition: The blocks, in contracted space.
         view_components: Components of the view-dependent colour
             (:func:`cvtgs.cells.view_components`).
@@ -196,9 +194,7 @@ class SceneScan:
     min_opacity: float
     max_flyaway_mass: float
     mean_weight: float
-    min_weight: float
     cell_weight: float
-    area_power: float
     partition: KdPartition
     view_components: Float[Tensor, "c k"]
     mass: float
@@ -303,8 +299,7 @@ def scan_scene(
     power = config.cvt.area_power
     weights = cvt.gaussian_weights(known.opacities, known.apparent_areas, power)[rows]
     mean_weight = float(weights.mean()) or 1.0
-    min_weight = mean_weight * config.cvt.weight_floor
-    weights = weights.clamp_min(min_weight)
+    weights = weights.clamp_min(mean_weight * config.cvt.weight_floor)
     cell_weight = _cell_weight(weights, cell_count / rows_per_sample)
     shares = (weights / cell_weight).clamp_max(1.0) if cell_weight > 0 else torch.ones_like(weights)
     measure = 0.5 / len(shares) + 0.5 * shares / shares.sum()
@@ -315,9 +310,7 @@ def scan_scene(
         min_opacity=min(float(known.opacities[rows].amin()), config.filter.min_opacity),
         max_flyaway_mass=_max_flyaway_mass(totals, config.filter.max_flyaway_share),
         mean_weight=mean_weight,
-        min_weight=min_weight,
         cell_weight=cell_weight,
-        area_power=power,
         partition=partition_space(frame.contract(sample.means[rows]), measure, blocks),
         view_components=_view_components(sample, known, rows, config),
         mass=totals.mass,
