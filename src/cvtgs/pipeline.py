@@ -1,6 +1,7 @@
 """The stages of the method in order: filter, weigh, tessellate, allocate, merge, correct.
 
-Single runs, levels, protected regions and out-of-core runs all call these functions.
+Single runs, levels and protected regions call :func:`reduce_scene`. Out-of-core runs of several
+blocks call the functions of each stage in the same order, block by block (``outofcore/run.py``).
 """
 
 import math

@@ -13,7 +13,7 @@ import pytest
 
 import cvtgs
 from cvtgs.cli.main import build_parser, main
-from cvtgs.cli.options import READABLE, WRITABLE
+from cvtgs.cli.options import PRESET_NAMES, READABLE, WRITABLE
 from cvtgs.io.formats import READABLE_SUFFIXES, WRITABLE_SUFFIXES
 
 
@@ -35,6 +35,11 @@ def test_help_names_every_format():
     written, read = (set(re.findall(r"[\w-]*(?:\.\w+)+", text)) for text in (WRITABLE, READABLE))
     assert written == set(WRITABLE_SUFFIXES)
     assert read == {*READABLE_SUFFIXES, "meta.json", "lod-meta.json"}
+
+
+def test_help_names_every_preset_in_order():
+    names = re.sub(r"\(.*?\) or", "", PRESET_NAMES)
+    assert re.findall(r"\w+", names) == list(cvtgs.PRESETS)
 
 
 def test_version_starts_with_that_of_cvtgs(capsys):
@@ -375,7 +380,7 @@ def test_every_option_of_every_command_is_in_every_script(capsys):
             for action in parser._actions:
                 for name in action.option_strings[-1:]:
                     assert (f"-l {name[2:]} " if shell == "fish" else name) in script
-    assert "__fish_seen_subcommand_from simplify' -l preset -x -a 'draft fast" in script
+    assert "__fish_seen_subcommand_from simplify' -l preset -x -a 'draft " in script
     assert "__fish_seen_subcommand_from completion' -x -a 'bash zsh fish'" in script
 
 

@@ -46,7 +46,7 @@ def test_a_shipped_checkpoint_selects_its_preset(preset):
     assert simplifier.checkpoint.name == preset
     report = simplifier.run(random_scene(100), 0.1).report
     assert report.checkpoint == preset
-    assert report.stages[-1].stage == "network"
+    assert "network" in {stage.stage for stage in report.stages}
 
 
 @each_preset
@@ -68,7 +68,7 @@ def test_none_merges_by_moments_alone(preset, how):
     small, report = simplifier.run(scene, 0.1)
     assert simplifier.checkpoint is None
     assert report.checkpoint == "none"
-    assert [stage.stage for stage in report.stages][-1] == "merge"
+    assert "network" not in {stage.stage for stage in report.stages}
     reference = merge_scene(scene, 30, SimplifyConfig.from_preset(preset))
     assert same_bits(small, standardized(reference.merged))
 

@@ -91,6 +91,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 }
 """Changes of each preset to the defaults; ``standard`` has none.
 
+They are in the order of time, from the fastest to the best, on which ``--time-budget`` relies.
+
 ``paper`` is CVT-GS (Li et al. 2026) as published, with a network that was trained here; the design
 page lists the details that the publication leaves open.
 """
