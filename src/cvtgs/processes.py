@@ -7,7 +7,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from types import TracebackType
@@ -24,6 +24,9 @@ else:
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+
+WAKE_SECONDS = 0.5
+"""Longest wait for a result at once: on Windows, Ctrl-C does not end a wait."""
 
 MOST_ON_WINDOWS = 61
 """Largest number of processes that a pool of Python has on Windows."""
@@ -100,6 +103,8 @@ class LocalWorkers:
             for one in items:  # the pool refuses work if a process ended since the last call
                 futures.append(self._pool.submit(_call, pickle.dumps((function, one))))
             while futures:  # drops results once yielded: a scan has dozens of megabytes
+                while not wait([futures[0]], WAKE_SECONDS).done:
+                    pass
                 result: Result = pickle.loads(futures.popleft().result())
                 yield result
         except BrokenProcessPool as error:

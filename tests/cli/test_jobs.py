@@ -135,6 +135,24 @@ def test_invalid_jobs_are_refused_before_the_work(
     assert not list(Path().glob("out/*"))
 
 
+@pytest.mark.parametrize(("system", "status"), [("linux", 0), ("darwin", 1), ("win32", 1)])
+def test_names_that_differ_by_case_are_one_file_on_some_systems(
+    scenes: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    system: str,
+    status: int,
+) -> None:
+    Path("more").mkdir()
+    Path("more/A.ply").write_bytes(Path("a.ply").read_bytes())
+    if sys.platform in ("darwin", "win32") and status == 0:
+        pytest.skip("names of this system ignore case")
+    monkeypatch.setattr(sys, "platform", system)
+    assert main(["convert", "a.ply", "more/A.ply", "-o", "out"]) == status
+    printed = capsys.readouterr()
+    assert ("two scenes must not have the same name in out" in printed.err) == bool(status)
+
+
 def test_a_folder_with_an_impossible_name_is_one_sentence(
     scenes: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,5 +1,7 @@
 """The command line as a whole: help, usage, errors, exit codes, interruption, completion."""
 
+import errno
+import io
 import os
 import re
 import shutil
@@ -234,6 +236,17 @@ def test_an_unwritable_stderr_does_not_change_the_exit_status(tmp_path, words, s
         command = [sys.executable, "-m", "cvtgs", *words]
         done = subprocess.run(command, stderr=full, check=False, cwd=tmp_path)
     assert done.returncode == status
+
+
+def test_a_reader_that_ends_is_no_error_on_windows(monkeypatch, capsys):
+    class Pipe(io.StringIO):
+        def write(self, text):
+            raise OSError(errno.EINVAL, "Invalid argument")
+
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(sys, "stdout", Pipe())
+    assert main(["completion", "bash"]) == 141
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.skipif(os.name != "posix", reason="closes pipes as POSIX does")

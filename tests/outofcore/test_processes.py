@@ -1,5 +1,6 @@
 """Blocks in local processes: the same bits as in one process, errors, and how they end."""
 
+import math
 import os
 import signal
 import subprocess
@@ -54,6 +55,20 @@ def test_calls_are_shared_and_results_in_order(workers):
     assert [number for number, _, _ in found] == list(range(40))
     assert {threads for _, _, threads in found} == {max(1, core_count() // 2)}
     assert os.getpid() not in {pid for _, pid, _ in found}
+
+
+def test_no_wait_for_a_result_is_longer_than_a_second(workers, monkeypatch):
+    """On Windows, Ctrl-C does not end a wait."""
+    waits, true = [], threading.Condition.wait
+
+    def look(self, timeout=None):
+        if threading.current_thread() is threading.main_thread():
+            waits.append(timeout or math.inf)
+        return true(self, timeout)
+
+    monkeypatch.setattr(threading.Condition, "wait", look)
+    assert list(workers(time.sleep, [0.2])) == [None]
+    assert 0 < max(waits) <= 1
 
 
 def test_errors_of_workers_reach_the_caller(workers):

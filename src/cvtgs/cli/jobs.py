@@ -240,14 +240,16 @@ def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
 
     sources = [Path(path) for pattern in options.paths for path in _expanded(pattern)]
     targets: dict[Path, Path] = {}
+    named: dict[str, Path] = {}
     for source in sources:
-        target = options.folder / _output_name(source, options.suffix)
-        if target in targets:
+        name = _output_name(source, options.suffix)
+        before = named.setdefault(_without_case(name), source)
+        if before is not source:
             raise InvalidArgumentError(
                 f"two scenes must not have the same name in {options.folder}, found "
-                f"{targets[target]} and {source}."
+                f"{before} and {source}."
             )
-        targets[target] = source
+        targets[options.folder / name] = source
     for target, source in targets.items():
         for other in sources:
             if other != source and is_same_file(target, other):
@@ -262,6 +264,11 @@ def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
         )
         for target, source in targets.items()
     ]
+
+
+def _without_case(name: str) -> str:
+    """Return a text that names of the same file share: macOS and Windows ignore their case."""
+    return name.lower() if sys.platform in ("darwin", "win32") else name
 
 
 def expanded(patterns: Iterable[Path]) -> list[Path]:

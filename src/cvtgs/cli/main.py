@@ -1,6 +1,7 @@
 """The program ``cvtgs``: parse the command line, run a command, turn errors into exit codes."""
 
 import argparse
+import errno
 import gc
 import io
 import os
@@ -58,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return stop.code
             if not isinstance(error, CvtgsError):
                 raise
-            if isinstance(error.__cause__, BrokenPipeError):  # as in "cvtgs info | head"
+            if _is_closed_pipe(error.__cause__):  # as in "cvtgs info | head"
                 return PIPE_CLOSED
             say(f"cvtgs: error: {error}", file=sys.stderr)
             return 1
@@ -67,6 +68,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
                 signal.signal(number, handler)
     return 0
+
+
+def _is_closed_pipe(error: BaseException | None) -> bool:
+    """Return whether the reader of standard output has ended; Windows reports it differently."""
+    if sys.platform == "win32" and isinstance(error, OSError):
+        return error.errno in (errno.EPIPE, errno.EINVAL)
+    return isinstance(error, BrokenPipeError)
 
 
 def _run(words: Sequence[str]) -> None:
