@@ -82,18 +82,20 @@ def merge_pairs(
     }
     config = config.model_copy(update=update)
     table = torch.cat([torch.atleast_2d(values).float() for values in groups])  # fast to gather
-    total, labels = len(groups.masses), np.arange(len(groups.masses))
+    total = len(groups.masses)
+    labels = np.arange(total, dtype=np.int64)  # numpy 1 on Windows would take 32 bits
     pairs = _distinct_pairs(labels.repeat(neighbors.shape[1]), neighbors.numpy().ravel())
     while total > count:
         if len(pairs) == 0:  # no neighbouring pairs are left: merge arbitrary ones
-            pairs = _distinct_pairs(np.arange(total - 1), np.arange(1, total))
+            rows = np.arange(total, dtype=np.int64)
+            pairs = _distinct_pairs(rows[:-1], rows[1:])
         first, second = pairs >> ROW_BITS, pairs & LAST_ROW
         wanted = min(total - count, max(1, int(SHARE_PER_ROUND * total)))
         costs = _pair_costs(table, torch.from_numpy(first), torch.from_numpy(second), config)
         kept, merged = _cheapest_disjoint(first, second, costs.numpy(), wanted, total)
         is_kept = np.ones(total, dtype=bool)
         is_kept[merged] = False
-        target = np.cumsum(is_kept) - 1
+        target = np.cumsum(is_kept, dtype=np.int64) - 1
         target[merged] = target[kept]
         labels, total = target[labels], total - len(merged)
         if total > count:

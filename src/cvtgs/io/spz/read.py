@@ -223,7 +223,7 @@ def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Conte
         )
     elif not stream.eof:
         raise FileFormatError(f"{path}: must be intact gzip data, found it cut short.")
-    ends = np.cumsum(list(header.sizes.values()))[:-1]
+    ends = np.cumsum(list(header.sizes.values()), dtype=np.int64)[:-1]
     blocks = np.split(np.frombuffer(payload, np.uint8), ends)
     return _Content(header, dict(zip(header.sizes, blocks, strict=True)))
 
