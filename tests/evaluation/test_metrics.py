@@ -8,7 +8,15 @@ import torch
 from scipy.ndimage import correlate1d
 
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.evaluation import EvaluationSettings, alpha_bias, alpha_error, evaluate, psnr, ssim
+from cvtgs.evaluation import (
+    EvaluationSettings,
+    Score,
+    alpha_bias,
+    alpha_error,
+    evaluate,
+    psnr,
+    ssim,
+)
 from cvtgs.losses import ssim_loss
 from cvtgs.views import automatic_views
 from scenes import random_scene
@@ -154,3 +162,8 @@ def test_names_of_scenes_are_texts():
     scene = random_scene(3)
     with pytest.raises(InvalidArgumentError, match="names of scenes must be texts, found 1"):
         evaluate(scene, {1: scene}, automatic_views(scene, 1, width=32, height=32))
+
+
+def test_a_score_of_no_views_is_refused():
+    with pytest.raises(InvalidArgumentError, match="at least one view, found none"):
+        Score.of([])

@@ -44,6 +44,12 @@ def test_gsplat_values_are_read_as_stored_values() -> None:
     assert scene.sh_degree == 1
 
 
+@pytest.mark.parametrize("value", [None, 3, "scene.ply", [torch.zeros(2, 3)]])
+def test_anything_but_a_dictionary_is_refused(value: Any) -> None:
+    with pytest.raises(InvalidSceneError, match="a scene is made from a dictionary, found "):
+        from_dict(value)
+
+
 def test_an_empty_dictionary_is_an_empty_scene() -> None:
     assert (
         len(from_dict({name: value[:0] for name, value in gsplat().items()}, activated=True)) == 0

@@ -9,8 +9,16 @@ from typing import Any
 import pytest
 import torch
 
-from cvtgs.errors import DroppedDataWarning
-from cvtgs.streams import StreamPlan, blocks, sog, write_sog_stream, write_tiles
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
+from cvtgs.streams import (
+    StreamPlan,
+    blocks,
+    plan_stream,
+    sog,
+    stream_file,
+    write_sog_stream,
+    write_tiles,
+)
 from cvtgs.streams.plan import plan_part
 from scenes import random_scene
 
@@ -156,3 +164,12 @@ def test_every_block_with_rows_has_a_gaussian_at_every_level(tmp_path: Path) -> 
     share(SimpleNamespace(job=job), [14, 6, 2], [12, 0, 1, 1], [12.0, 0.0, 1.0, 1.0])
     found = json.loads((tmp_path / "targets.json").read_text())["targets"]
     assert found == [[12, 4, 1], [0, 0, 0], [1, 1, 1], [1, 1, 1]]
+
+
+@pytest.mark.parametrize("radii", [float("nan"), -1.0, "3"])
+def test_a_distance_that_is_no_number_from_0_is_refused(radii: Any, tmp_path: Path) -> None:
+    wanted = "the environment must begin at a number of radii, at least 0, found "
+    with pytest.raises(InvalidArgumentError, match=wanted):
+        plan_stream([level([0, 1], None), level([0], None)], environment_radii=radii)
+    with pytest.raises(InvalidArgumentError, match=wanted):
+        stream_file("none.ply", tmp_path, [0.5], kind="sog", environment_radii=radii)

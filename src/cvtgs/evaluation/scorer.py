@@ -56,10 +56,15 @@ class Score(Record):
         Returns:
             The score.
 
+        Raises:
+            InvalidArgumentError: There is no value.
+
         Example:
             >>> Score.of([20.0, 30.0]).mean
             25.0
         """
+        if len(values) == 0:
+            raise InvalidArgumentError("a score needs the value of at least one view, found none.")
         return cls(mean=math.fsum(values) / len(values), views=tuple(values))
 
 

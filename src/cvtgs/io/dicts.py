@@ -62,7 +62,8 @@ def from_dict(
         The scene, on the device of the tensors.
 
     Raises:
-        InvalidSceneError: A name is missing, unknown or duplicate, or a value is invalid.
+        InvalidSceneError: It is no dictionary, a name is missing, unknown or duplicate, or a value
+            is invalid.
 
     Example:
         >>> scene = from_dict({
@@ -72,6 +73,8 @@ def from_dict(
         >>> scene.log_scales[0].tolist(), scene.logit_opacities.tolist()
         ([0.0, 0.0, 0.0], [0.0, 0.0])
     """
+    if not hasattr(mapping, "keys"):
+        raise InvalidSceneError(f"a scene is made from a dictionary, found {shown(mapping)}.")
     mapping = dict(mapping)
     tensors = {name: _as_tensor(key, mapping[key]) for name, key in _keys(mapping).items()}
     double = any(tensor.dtype == torch.float64 for tensor in tensors.values())

@@ -48,7 +48,7 @@ from cvtgs.streams.files import (
     warn_of_losses,
     write_index,
 )
-from cvtgs.streams.plan import CHUNK_GAUSSIANS, near_rows, plan_part
+from cvtgs.streams.plan import CHUNK_GAUSSIANS, check_environment, near_rows, plan_part
 from cvtgs.streams.sog import SogFormat
 from cvtgs.streams.tiles import TilesFormat
 from cvtgs.validity import with_finite_opacities
@@ -206,6 +206,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
             f"3D Tiles have axes of their own (z up), so the axes of the output must be "
             f"{SCENE_AXES}, found {axes[1]!r}."
         )
+    check_environment(environment_radii)
     simplifier, workers = simplifier or Simplifier(device="cpu"), workers or sequentially
     check_config(simplifier.config, with_images=False)
     rows = open_rows(source)

@@ -21,6 +21,7 @@ from cvtgs.io.arrays import morton_rows
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import rotation_matrices
 from cvtgs.scene import GaussianScene
+from cvtgs.text import shown
 
 CHUNK_GAUSSIANS = 1 << 15
 """Maximum number of finest Gaussians in a chunk, unless one coarse Gaussian replaces more."""
@@ -150,7 +151,8 @@ def plan_stream(
         replaces it.
 
     Raises:
-        InvalidArgumentError: There is no level, two have the same size, or chunks would be empty.
+        InvalidArgumentError: There is no level, two have the same size, chunks would be empty, or
+            the distance of the environment is no number from 0.
 
     Example:
         >>> from cvtgs import Simplifier, synthetic
@@ -159,6 +161,7 @@ def plan_stream(
         >>> sum(len(chunk.rows[0]) for chunk in plan.chunks)
         250
     """
+    check_environment(environment_radii)
     ordered = tuple(sorted(levels, key=lambda level: -len(level.scene)))
     counts = [len(level.scene) for level in ordered]
     if not counts or len(set(counts)) < len(counts) or chunk_gaussians < 1:
@@ -168,6 +171,14 @@ def plan_stream(
         )
     near = near_rows(ordered[-1].scene, robust_frame(ordered[0].scene.means), environment_radii)
     return plan_part(ordered, near, chunk_gaussians=chunk_gaussians)
+
+
+def check_environment(radii: float | None) -> None:
+    """Check the distance at which the environment begins, in robust radii; None for none."""
+    if radii is not None and not (isinstance(radii, int | float) and radii >= 0):
+        raise InvalidArgumentError(
+            f"the environment must begin at a number of radii, at least 0, found {shown(radii)}."
+        )
 
 
 def near_rows(
