@@ -234,6 +234,11 @@ def test_no_print_outside_cli_and_no_assert():
     assert found == []
 
 
+def test_warnings_are_issued_in_one_way():
+    found = [relative(path) for path in FILES if "warnings.warn(" in TEXTS[path]]
+    assert found == ["errors.py"]  # its warn() finds the line of the caller
+
+
 def test_private_names_stay_in_their_file():
     found = [
         f"{relative(path)} imports {name}"

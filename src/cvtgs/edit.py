@@ -1,7 +1,6 @@
 """Edits of scenes: crop, drop, move and merge. Unaffected values stay bit-identical."""
 
 import math
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from cvtgs.boxes import Box, Corner, inside
 from cvtgs.devices import without_autocast
-from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn
 from cvtgs.math.parameters import multiply_quats, rotation_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS, rotated_rest
 from cvtgs.scene import (
@@ -317,18 +316,15 @@ def merge(scenes: Iterable[GaussianScene]) -> GaussianScene:
     common &= {name for scene in scenes for name in scene.extras}
     missing = sorted({name for scene in scenes for name in scene.extras} - common)
     if missing:
-        warnings.warn(
+        warn(
             f"left out {'columns' if len(missing) > 1 else 'column'} "
             f"{', '.join(map(repr, missing))}, which not all of the scenes to merge have.",
             DroppedDataWarning,
-            stacklevel=2,
         )
     if len({scene.antialiased for scene in scenes}) > 1:
-        warnings.warn(
+        warn(
             "some of the scenes to merge were trained with anti-aliasing and others were not; "
             "viewers will show the latter too soft.",
-            UserWarning,
-            stacklevel=2,
         )
     dtype = torch.float64 if any(s.dtype == torch.float64 for s in scenes) else torch.float32
     degree = max(scene.sh_degree for scene in scenes)

@@ -3,8 +3,11 @@
 import errno
 import os
 import re
+import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 __all__ = [
     "CheckpointError",
@@ -105,6 +108,22 @@ class MissingDependencyError(CvtgsError, ImportError):
 
 class DroppedDataWarning(UserWarning):
     """Data of a scene were dropped or clamped; the message says what, how much and why."""
+
+
+def warn(text: str, category: type[Warning] = UserWarning) -> None:
+    """Issue a warning at the line of the caller's program that led to it.
+
+    Lines of cvtgs are skipped, and those between them: decorators of torch and of contextlib.
+    """
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and _is_within(frame):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(text, category, stacklevel=level)
+
+
+def _is_within(frame: FrameType) -> bool:
+    module = str(frame.f_globals.get("__name__"))
+    return module.partition(".")[0] in ("cvtgs", "contextlib", "torch")
 
 
 def reason_of(error: Exception) -> str:

@@ -1,7 +1,6 @@
 """Detection of rows that renderers cannot draw, and standardization of valid rows."""
 
 import math
-import warnings
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -9,7 +8,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from cvtgs.errors import DroppedDataWarning, InvalidSceneError
+from cvtgs.errors import DroppedDataWarning, InvalidSceneError, warn
 from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 
@@ -80,10 +79,9 @@ def check_rows(scene: GaussianScene) -> CheckedScene:
             f"none of the {len(scene)} Gaussians is valid; "
             f"found NaN, infinite or zero values in {text}."
         )
-    warnings.warn(
+    warn(
         f"dropped {count} of {len(scene)} Gaussians with NaN, infinite or zero values ({text}).",
         DroppedDataWarning,
-        stacklevel=2,
     )
     return CheckedScene(scene.select(~dropped), reasons, count, ~dropped)
 
@@ -231,11 +229,9 @@ def warn_of_lost_digits(scene: GaussianScene) -> None:
     if step:
         middle = scene.means.nanmedian(dim=0).values.double()
         shift = ",".join(f"{-round(value)}" for value in middle.tolist())
-        warnings.warn(
+        warn(
             f"positions lie {float(middle.abs().amax()):.3g} from the origin, where float32 only "
             f"resolves steps of {step:.3g}: precision is already lost. Write the scene again from "
             f"its source, with positions shifted by {shift} before they become float32, and keep a "
             f"record of the shift.",
-            UserWarning,
-            stacklevel=3,
         )

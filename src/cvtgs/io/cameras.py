@@ -1,7 +1,6 @@
 """Read cameras of any capture format, in one common form: views and lenses."""
 
 import os
-import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from cvtgs.errors import (
     FileFormatError,
     InputNotFoundError,
     InvalidArgumentError,
+    warn,
 )
 from cvtgs.io.files import is_file, is_folder
 
@@ -135,11 +135,10 @@ def _intrinsics(lens: Lens, *, width: int, height: int) -> Float[np.ndarray, "3 
 def _warn_of_distortion(views: Sequence[View], path: str) -> None:
     count = sum(view.lens.distorted for view in views)
     if count:
-        warnings.warn(
+        warn(
             f"{path}: left out the lens distortion of {count:,} of {len(views):,} cameras, since "
             f"rendering uses pinhole cameras; compare with undistorted photographs.",
             DroppedDataWarning,
-            stacklevel=4,
         )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cvtgs.errors import CvtgsError, FileFormatError, InvalidSceneError, is_out_of_memory
+from cvtgs.errors import CvtgsError, FileFormatError, InvalidSceneError, is_out_of_memory, warn
 from cvtgs.io.dicts import check_tensors, from_dict
 from cvtgs.io.files import check_stored, is_file, open_input
 from cvtgs.math.spherical_harmonics import SH_C0
@@ -47,11 +47,9 @@ def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
     """
     second = path.with_name(path.name.replace("_rank0.pt", "_rank1.pt"))
     if second != path and is_file(second):
-        warnings.warn(
+        warn(
             f"{path}: holds the Gaussians of one GPU; {second.name} and further files beside it "
             f"hold the others: add them with cvtgs convert IN OUT --merge FILE.",
-            UserWarning,
-            stacklevel=3,
         )
     with _damage_named(path):
         tensors, splatfacto = _scene_tensors(_unpickled(path), path)

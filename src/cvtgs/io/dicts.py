@@ -1,6 +1,5 @@
 """Convert scenes from and to the dictionaries of gsplat and nerfstudio."""
 
-import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvtgs.errors import InvalidSceneError
+from cvtgs.errors import InvalidSceneError, warn
 from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
@@ -94,10 +93,9 @@ def from_dict(
         tensors["logit_opacities"] = parameters.logit_from_opacity(opacities)
     scene = GaussianScene(**tensors, extras={}, comments=(), layout=())
     if not activated and (unlikely := activated_values(scene)):
-        warnings.warn(
+        warn(
             f"{' and '.join(unlikely)}: they are read as stored values (logarithms of scales, "
             f"logits of opacities) but look activated; if they are, pass activated=True.",
-            stacklevel=2,
         )
     return scene
 

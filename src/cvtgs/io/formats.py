@@ -1,7 +1,6 @@
 """Read and write scenes in the format that the suffix of the file name selects."""
 
 import os
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -18,6 +17,7 @@ from cvtgs.errors import (
     FileFormatError,
     InvalidArgumentError,
     memory_errors,
+    warn,
 )
 from cvtgs.io.atomic import atomic_output, check_output
 from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
@@ -265,10 +265,9 @@ def save(
     scene = change_axes(scene, SCENE_AXES, axes)
     dropped = losses(scene, named).dropped
     if dropped:
-        warnings.warn(
+        warn(
             f"{name}: files of this format do not hold {'; '.join(dropped)}.",
             DroppedDataWarning,
-            stacklevel=2,
         )
     options = {"version": spz_version, "axes": axes} if suffix == ".spz" else {}
     write: Callable[..., None] = resolve_name(_WRITERS[suffix])

@@ -5,7 +5,6 @@ until the wanted number of groups is left, and gives each group to the block of 
 """
 
 import json
-import warnings
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -17,6 +16,7 @@ from cvtgs.cells import Moments
 from cvtgs.config import AllocationConfig
 from cvtgs.counts import shared_out
 from cvtgs.devices import one_thread
+from cvtgs.errors import warn
 from cvtgs.grouping import REASSIGN, allocation_at
 from cvtgs.io import atomic_output
 from cvtgs.io.tensors import map_tensors, save_tensors
@@ -68,11 +68,9 @@ def allocate(job: Job) -> None:
     cell_counts = _cell_counts(job)
     regions = _regions(cell_counts, job.cell_room)
     if len(regions) > 1:
-        warnings.warn(
+        warn(
             f"{sum(cell_counts)} cells do not fit into memory together, so merge costs are only "
             f"compared within {len(regions)} parts of the scene; raise --memory if possible.",
-            UserWarning,
-            stacklevel=5,
         )
     sizes = [sum(cell_counts[block] for block in region) for region in regions]
     counts = shared_out(manifest.total, sizes, rooms=sizes)

@@ -3,7 +3,6 @@
 import math
 import os
 import shutil
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -16,7 +15,7 @@ from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, shortfall, target_count
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
-from cvtgs.errors import ConfigError, DroppedDataWarning
+from cvtgs.errors import ConfigError, DroppedDataWarning, warn
 from cvtgs.evaluation.scorer import check_seen
 from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output, check_save, load, save
@@ -353,11 +352,10 @@ def report_blocks(
     total, valid = job.source.count, scan.row_count + scan.kept_count
     if valid < total:
         reasons = ", ".join(f"{name} {number}" for name, number in scan.invalid_rows.items())
-        warnings.warn(
+        warn(
             f"dropped {total - valid} of {total} Gaussians with NaN, infinite or zero values "
             f"({reasons}).",
             DroppedDataWarning,
-            stacklevel=4,
         )
     tessellated = job.blocks_with_rows() if job.goes_by_steps else []
     parts = [map_tensors(job.parts_path(block))[0] for block in tessellated]

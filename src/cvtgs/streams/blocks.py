@@ -4,7 +4,6 @@ import hashlib
 import json
 import os
 import shutil
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,7 +18,7 @@ from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, target_count
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
-from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn
 from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output, change_axes
 from cvtgs.io.atomic import make_folder
@@ -250,7 +249,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
     with lock, without_autocast():
         parts, resumed = _run(spec, targets, simplifier, workers, StageClock(listener, HOST))
         write_index(form, parts, spec.folder)
-        warn_of_losses(parts, Path(folder), stacklevel=4)
+        warn_of_losses(parts, Path(folder))
         publish(spec.folder, Path(folder), kind, overwrite=overwrite)
         shutil.rmtree(Path(spec.job.folder).parent, ignore_errors=True)
     chunks = sum(part.chunks for part in parts)
@@ -288,11 +287,10 @@ def _write_targets(
     """Divide every level among the blocks by weight; blocks with rows get at least one Gaussian."""
     total = sum(rows)
     if total < spec.job.source.count:
-        warnings.warn(
+        warn(
             f"dropped {spec.job.source.count - total} of {spec.job.source.count} Gaussians with "
             "NaN, infinite or zero values.",
             DroppedDataWarning,
-            stacklevel=5,
         )
     rooms, levels = list(rows), []
     for target in targets:

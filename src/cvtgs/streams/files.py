@@ -4,7 +4,6 @@ import json
 import os
 import re
 import shutil
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ from cvtgs.errors import (
     OutputError,
     OutputExistsError,
     reason_of,
+    warn,
 )
 from cvtgs.io import atomic_output, check_output
 from cvtgs.io.atomic import make_folder, replace_file
@@ -118,7 +118,7 @@ def write_stream(
     with _hidden_folder(place) as hidden:
         part = form.write_part(plan, hidden, part=0, listener=listener)
         write_index(form, [part], hidden)
-        warn_of_losses([part], place, stacklevel=5)
+        warn_of_losses([part], place)
         publish(hidden, place, form.kind, overwrite=overwrite)
     return part.levels
 
@@ -130,17 +130,16 @@ def write_index(form: StreamFormat, parts: Sequence[StreamPart], folder: Path) -
         file.write(content.encode())
 
 
-def warn_of_losses(parts: Sequence[StreamPart], place: Path, *, stacklevel: int) -> None:
+def warn_of_losses(parts: Sequence[StreamPart], place: Path) -> None:
     """Warn once of data that the files of the parts do not hold, with the sums of their counts."""
     dropped = Counter[str]()
     for part in parts:
         dropped.update(part.dropped)
     if dropped:
-        warnings.warn(
+        warn(
             f"{place}: the files of this stream, all levels together, do not hold "
             f"{'; '.join(phrases(dropped))}.",
             DroppedDataWarning,
-            stacklevel=stacklevel,
         )
 
 

@@ -2,7 +2,6 @@
 
 import os
 import platform
-import warnings
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.devices import chosen_device, device_name
-from cvtgs.errors import RunError
+from cvtgs.errors import RunError, warn
 from cvtgs.evaluation import Comparison, EvaluationSettings, compare
 from cvtgs.evaluation.scorer import mean_of
 from cvtgs.io import load, scene_size
@@ -130,7 +129,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         if failures and not runs:
             raise RunError(f"every run failed; {failures[0].name}: {failures[0].reason}")
         for failure in failures:
-            warnings.warn(f"{failure.name} failed: {failure.reason}", UserWarning, stacklevel=2)
+            warn(f"{failure.name} failed: {failure.reason}")
         sizes = {run.task.name: run.path.stat().st_size for run in runs}
         source_name = Path(source).name
         comparison = compare(

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.config.simplify import unknown_preset
 from cvtgs.counts import target_count, written
-from cvtgs.errors import InvalidArgumentError, RunError
+from cvtgs.errors import InvalidArgumentError, RunError, warn
 from cvtgs.progress import ProgressEvent, ProgressListener
 from cvtgs.report import SimplifyReport
 from cvtgs.tradeoff.results import Failure
@@ -192,7 +191,7 @@ def pass_warnings_on(errors: str, warned: set[str]) -> None:
     for line in errors.splitlines():
         if line.startswith(WARNING) and line not in warned:
             warned.add(line)
-            warnings.warn(line.removeprefix(WARNING), UserWarning, stacklevel=2)
+            warn(line.removeprefix(WARNING))
 
 
 def run_process(command: Sequence[str]) -> ProcessCost:

@@ -1,7 +1,6 @@
 """The cameras of a capture, if they are in the folder of its model."""
 
 import os
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.errors import CvtgsError, FileFormatError
+from cvtgs.errors import CvtgsError, FileFormatError, warn
 from cvtgs.scene import GaussianScene
 
 _LEAST_SEEN = 0.01
@@ -78,7 +77,7 @@ def find_own_cameras(scene: GaussianScene, path: str | os.PathLike[str]) -> OwnC
         except FileFormatError as error:
             if str(error) not in faults:
                 faults.add(str(error))
-                warnings.warn(f"cameras are not used: {error}", UserWarning, stacklevel=2)
+                warn(f"cameras are not used: {error}")
             continue
         except CvtgsError:  # there are none
             continue

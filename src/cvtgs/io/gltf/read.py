@@ -1,6 +1,5 @@
 """Read the Gaussians of all nodes of a glTF scene, transformed by their nodes."""
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from cvtgs.edit import Motion, merge, move
-from cvtgs.errors import DroppedDataWarning
+from cvtgs.errors import DroppedDataWarning, warn
 from cvtgs.io.arrays import Arrays, log_scales_of, logits_of, scene_of, unit_quats
 from cvtgs.io.axes import SCENE_AXES, change_axes
 from cvtgs.io.files import (
@@ -138,11 +137,10 @@ def _splats(file: GltfFile) -> Iterator[_Placed]:
             splatting = validated(_Splatting, primitive.extensions[SPLATS], f"{where}: {SPLATS!r}")
             yield _Placed(primitive, splatting, where, matrix)
     if others:
-        warnings.warn(
+        warn(
             f"{file.path}: left out {others:,} mesh "
             f"{'primitive that is' if others == 1 else 'primitives that are'} not Gaussians.",
             DroppedDataWarning,
-            stacklevel=4,
         )
 
 
@@ -203,11 +201,10 @@ def _read_primitive(file: GltfFile, one: _Placed, *, trust_sizes: bool) -> Gauss
             f"{primitive.mode} and {shown(splatting.kernel)}"
         )
     if splatting.colorSpace != COLOR_SPACE:
-        warnings.warn(
+        warn(
             f"{file.path}: read colours of the colour space {shown(splatting.colorSpace)} as "
             f"{COLOR_SPACE!r}.",
             DroppedDataWarning,
-            stacklevel=4,
         )
     if SPZ in splatting.extensions:
         inside = validated(_Compression, splatting.extensions[SPZ], f"{where}: {SPZ!r}")

@@ -17,6 +17,7 @@ from cvtgs.errors import (
     FileFormatError,
     MissingDependencyError,
     how_to_install,
+    warn,
 )
 from cvtgs.io.files import open_input
 from cvtgs.io.ply.header import SCALARS, Element, Header, Layout, read_header, row_dtype
@@ -96,11 +97,10 @@ def _warn_of_dropped(header: Header, vertex: Element, path: str) -> None:
         if prop.count_type
     ]
     if dropped:
-        warnings.warn(
+        warn(
             f"{path}: left out {', '.join(dropped)}, since a scene holds one number per Gaussian "
             f"and property.",
             DroppedDataWarning,
-            stacklevel=4,
         )
 
 

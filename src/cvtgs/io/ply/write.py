@@ -1,6 +1,5 @@
 """Write a 3DGS scene to a PLY file, with the properties of its source where they fit."""
 
-import warnings
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -8,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvtgs.errors import DroppedDataWarning, InvalidSceneError
+from cvtgs.errors import DroppedDataWarning, InvalidSceneError, warn
 from cvtgs.io.ply.header import FLOAT_TYPES, SCALARS, Layout, header_bytes, row_dtype
 from cvtgs.io.ply.properties import (
     dtype_of,
@@ -98,11 +97,10 @@ def _warn_of_flattened(scene: GaussianScene, layout: Layout) -> None:
         return
     thick = int((scene.log_scales[:, 2] != FLAT_LOG_SCALE).sum())
     if thick:
-        warnings.warn(
+        warn(
             f"the third scale of {thick:,} Gaussians was left out, since the file that the scene "
             f"came from has no scale_2 (2DGS).",
             DroppedDataWarning,
-            stacklevel=4,
         )
 
 

@@ -1,7 +1,6 @@
 """Read an ``.spz`` file, without decompressing more than the header promises."""
 
 import struct
-import warnings
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from cvtgs.errors import DroppedDataWarning, FileFormatError
+from cvtgs.errors import DroppedDataWarning, FileFormatError, warn
 from cvtgs.io.arrays import HALF_RANGE, Arrays, logits_of_bytes, restore_largest, scene_of
 from cvtgs.io.axes import AXES, SCENE_AXES, change_axes
 from cvtgs.io.files import check_expansion, open_input
@@ -134,11 +133,10 @@ def decode_spz(
     found = _parsed(content, path, trust_sizes=trust_sizes)
     header, blocks = found.header, found.blocks
     if header.sh_degree > 3:
-        warnings.warn(
+        warn(
             f"{path}: left out the SH bands above degree 3 (the file has degree "
             f"{header.sh_degree}), since a scene holds degree 0 to 3.",
             DroppedDataWarning,
-            stacklevel=4,
         )
     scene = scene_of(_unpack(header, blocks), antialiased=header.antialiased)
     return change_axes(scene, axes or found.axes or SCENE_AXES, SCENE_AXES)
@@ -215,11 +213,10 @@ def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Conte
             f"some; write it as version 4."
         )
     if surplus:
-        warnings.warn(
+        warn(
             f"{path}: left out the bytes after the {header.count:,} Gaussians that the header "
             f"promises.",
             DroppedDataWarning,
-            stacklevel=6,
         )
     elif not stream.eof:
         raise FileFormatError(f"{path}: must be intact gzip data, found it cut short.")
