@@ -233,6 +233,40 @@ def test_calls_at_the_same_time_restore_the_number_of_threads(two_threads):
     assert found == [2, 2]
 
 
+def test_a_limited_call_leaves_threads_alone_that_start_meanwhile(two_threads):
+    """A server starts a thread during one call, and uses it after that call."""
+    inside, found = threading.Barrier(2, timeout=30), []
+
+    def count():
+        found.append(torch.get_num_threads())
+
+    def later():
+        count()
+        inside.wait()
+        inside.wait()  # the other call has ended
+        with one_thread():
+            count()
+        count()
+
+    def run(part):
+        inside.wait()  # both threads of the pool are limited
+        fresh = threading.Thread(target=count)
+        fresh.start()
+        fresh.join()
+        return torch.get_num_threads()
+
+    worker = threading.Thread(target=later)
+    with one_thread():
+        worker.start()
+        inside.wait()
+        assert torch.get_num_threads() == 1
+    inside.wait()
+    worker.join()
+    assert list(in_threads(run, range(2), HOST)) == [1, 1]
+    count()
+    assert found == [2, 1, 2, 2, 2, 2]
+
+
 def test_a_number_of_threads_that_the_program_sets_is_kept(two_threads):
     inside, found = threading.Barrier(2, timeout=30), []
 

@@ -44,6 +44,7 @@ class _Limits:
     """Running calls that limit torch, in the whole process, and the number before the first."""
 
     lock = threading.Lock()
+    setting = threading.Lock()
     running = 0
     threads = 1
 
@@ -198,13 +199,16 @@ def _in_pool(
 ) -> Iterator[Result]:
     has_gradients = torch.is_grad_enabled()
 
-    def start() -> None:
+    def start(before: int) -> None:
         _OWN.is_limited = True
-        torch.set_num_threads(1)
+        _limit_own(before)
         torch.set_grad_enabled(has_gradients)
 
     waiting: deque[Future[Result]] = deque()
-    with _restored_threads(), ThreadPoolExecutor(threads, initializer=start) as pool:
+    with (
+        _restored_threads() as before,
+        ThreadPoolExecutor(threads, initializer=start, initargs=(before,)) as pool,
+    ):
         try:
             for item in items:
                 waiting.append(pool.submit(function, item))
@@ -224,12 +228,27 @@ def _threads_of_torch() -> int:
         return own if own > 1 or _Limits.running == 0 or _OWN.is_limited else _Limits.threads
 
 
-@contextmanager
-def _restored_threads() -> Iterator[None]:
-    """Restore torch's number of threads at the end.
+def _limit_own(before: int) -> None:
+    """Limit torch to one thread in the calling thread alone.
 
-    Threads of the program that start while a call limits torch take its limit, 1, for their own
-    number, so they get that of the first call instead.
+    Threads of the program that start later take the number that any thread has set last, and keep
+    it; so another thread sets the number again that was in force before.
+    """
+    with _Limits.setting:
+        torch.get_num_threads()  # or the first operation here would take the number set last
+        torch.set_num_threads(1)
+        if before > 1:
+            setter = threading.Thread(target=torch.set_num_threads, args=(before,))
+            setter.start()
+            setter.join()
+
+
+@contextmanager
+def _restored_threads() -> Iterator[int]:
+    """Restore torch's number of threads at the end; yield it.
+
+    Threads of the program that start at the moment when a call limits torch take its limit, 1, for
+    their own number, so they get that of the first call instead.
     """
     with _Limits.lock:
         own = torch.get_num_threads()
@@ -238,7 +257,7 @@ def _restored_threads() -> Iterator[None]:
         before = own if own > 1 else _Limits.threads
         _Limits.running += 1
     try:
-        yield
+        yield before
     finally:
         with _Limits.lock:
             _Limits.running -= 1
@@ -274,9 +293,9 @@ def one_thread() -> Iterator[None]:
     if _OWN.is_limited:
         yield
         return
-    with _restored_threads():
+    with _restored_threads() as before:
         _OWN.is_limited = True
-        torch.set_num_threads(1)
+        _limit_own(before)
         try:
             yield
         finally:
