@@ -214,6 +214,17 @@ def test_cells_whose_members_touch_and_cells_of_one_are_left_alone():
     assert members is part
 
 
+@pytest.mark.parametrize(("size", "count"), [(0.09, 1), (0.11, 2)])
+def test_a_member_with_nearly_all_of_the_mass_is_kept(size, count):
+    """Of 0.992 of the mass it is, of 0.988 not. A wide one must not move: see ``DOMINANT``."""
+    scene = balls(0.5)
+    log_scales = torch.tensor([0.0, math.log(size)]).double()[:, None].expand(2, 3)
+    scene = scene.with_tensors({"log_scales": log_scales}, {})
+    small, part = kept(scene, torch.tensor([0, 0]))
+    assert len(part.order) == count
+    assert same_bits(small, scene.select(torch.tensor([0]))) == (count == 1)
+
+
 def test_only_cells_of_distant_members_get_a_representative():
     near, far = balls(0.5), balls(1e3)
     tensors = {

@@ -30,6 +30,9 @@ CHUNK_MEMBERS = 1 << 15
 OPAQUE = -math.log(0.01)
 """Optical depth of an opacity of 0.99, the largest that rasterizers paint at a pixel."""
 
+DOMINANT = 0.99
+"""A member with more than this share of the mass of its cell represents it."""
+
 
 def merge_cells(
     scene: GaussianScene,
@@ -273,13 +276,16 @@ def keep_representatives(
     *,
     areas: Float[Tensor, "n"],
 ) -> tuple[GaussianScene, Partition]:
-    """Replace merged Gaussians by one member of the cell where the members hardly touch.
+    """Replace merged Gaussians by a member where members hardly touch, or one is nearly all.
 
     Members that lie apart (points, needles, thin haze) have moments far wider than the members
     together: the merged Gaussian is a faint veil that shows less in an image than any member. A
     member of opacity a and area A removes about ``a^2 A`` of the squared error of an image; a
     Gaussian that spreads the mass M of the cell over its area A removes ``M^2 / A``. So the member
-    of largest ``a^2 A`` is kept, bit for bit, where that is more. Our own rule, not part of CVT-GS.
+    of largest ``a^2 A`` is kept, bit for bit, where that is more. It is also kept where it has more
+    than ``DOMINANT`` of the mass: moments would hardly differ, but a sky Gaussian as wide as its
+    distance covers an image as fog where a small move brings it from behind a camera to before it.
+    Our own rules, not part of CVT-GS.
 
     Args:
         scene: The Gaussians.
@@ -311,6 +317,7 @@ def keep_representatives(
     merged_areas = torch.exp(parameters.log_mean_projected_area(merged.log_scales.double()))
     best_masses, best_areas = masses.index_select(0, best), member_areas.index_select(0, best)
     is_kept = best_masses**2 * merged_areas > cell_masses**2 * best_areas
+    is_kept |= best_masses > DOMINANT * cell_masses
     counts = partition.counts
     is_kept &= counts > 1
     number, members = torch.stack([is_kept.sum(), (counts * is_kept).sum()]).tolist()
