@@ -120,6 +120,13 @@ def test_directions_that_do_not_exist_are_refused(target, up, text):
         look_at(eyes, targets, torch.tensor(up))
 
 
+def test_positions_may_have_several_dtypes():
+    eyes, targets = torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 5.0]], dtype=torch.float64)
+    found = look_at(eyes, targets, torch.tensor([0.0, -1.0, 0.0]))
+    assert found.dtype == torch.float64
+    assert torch.equal(found, look_at(eyes.double(), targets, torch.tensor([0.0, -1.0, 0.0])))
+
+
 def test_a_camera_may_look_along_its_up_direction():
     found = look_at(torch.zeros(1, 3), torch.tensor([[0.0, 5, 0]]), torch.tensor([0.0, -2, 0]))
     rotation = found[0, :3, :3]

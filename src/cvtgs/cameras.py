@@ -358,7 +358,9 @@ def look_at(
         >>> look_at(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 5.0]]), up)[0, 2, :3].tolist()
         [0.0, 0.0, 1.0]
     """
-    tiny = torch.finfo(eyes.dtype).tiny  # by default, normalize leaves short vectors short
+    dtype = torch.promote_types(torch.promote_types(eyes.dtype, targets.dtype), up.dtype)
+    eyes, targets, up = eyes.to(dtype), targets.to(dtype), up.to(dtype)
+    tiny = torch.finfo(dtype).tiny  # by default, normalize leaves short vectors short
     forward = torch.nn.functional.normalize(targets - eyes, dim=1, eps=tiny)
     upright = torch.nn.functional.normalize(up, dim=0, eps=tiny).expand_as(forward)
     for vectors, wish in (

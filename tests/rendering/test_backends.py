@@ -109,18 +109,19 @@ def test_kernels_work_without_a_folder_for_compiled_code():
 
 
 @pytest.mark.slow
-def test_numba_leaves_the_threads_of_torch_as_they_are(monkeypatch):
+def test_threads_of_torch_and_numba_stay_as_they_are(monkeypatch):
     pytest.importorskip("numba")
     monkeypatch.setenv("NUMBA_NUM_THREADS", "2")
     lines = python(
-        "import torch\n"
-        "from cvtgs.rendering.compiled import use_threads_of_torch\n"
+        "import numba, torch\n"
+        "from cvtgs.rendering.compiled import threads_of_torch\n"
         "for count in (1, 2, 3):\n"
         "    torch.set_num_threads(count)\n"
-        "    use_threads_of_torch()\n"
-        "    print(torch.get_num_threads())\n"
+        "    with threads_of_torch():\n"
+        "        print(torch.get_num_threads(), numba.get_num_threads())\n"
+        "print(torch.get_num_threads(), numba.get_num_threads())\n"
     )
-    assert lines == ["1", "2", "3"]
+    assert lines == ["1 1", "2 2", "3 2", "3 2"]
 
 
 @pytest.mark.slow

@@ -204,13 +204,30 @@ def drawn_rows(opacities: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
 def haze_share(
     opacities: Float[Tensor, "n"], apparent_masses: Float[Tensor, "n"], config: SimplifyConfig
 ) -> Float[Tensor, ""]:
-    """Return the share of the apparent mass that faint Gaussians hold, if they are drawn at all."""
+    """Compute the share of the apparent mass that faint Gaussians hold, if they are drawn at all.
+
+    Args:
+        opacities: Opacities.
+        apparent_masses: Their opacities times apparent areas.
+        config: The configuration; ``filter.min_opacity`` is used.
+
+    Returns:
+        The share, 0 to 1.
+    """
     masses = apparent_masses.double() * drawn_rows(opacities)
     return divide((masses * (opacities < config.filter.min_opacity)).sum(), masses.sum())
 
 
 def plan_haze(share: float, config: SimplifyConfig) -> Effect:
-    """Decide whether faint Gaussians are haze, by their share of the apparent mass."""
+    """Decide whether faint Gaussians are haze, by their share of the apparent mass.
+
+    Args:
+        share: Result of :func:`haze_share`.
+        config: The configuration; ``effects.haze`` and ``filter`` are used.
+
+    Returns:
+        The effect.
+    """
     choice, most = config.effects.haze, config.filter.max_mass_share
     below = config.filter.min_opacity
     return Effect(

@@ -2,7 +2,7 @@
 
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pydantic
 
@@ -16,13 +16,15 @@ MOST_PROBLEMS = 4
 class Record(pydantic.BaseModel):
     """Base of reports and measurements: frozen; infinite numbers are strings in JSON."""
 
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+    model_config: ClassVar[pydantic.ConfigDict] = pydantic.ConfigDict(
+        frozen=True, extra="forbid", ser_json_inf_nan="strings"
+    )
 
 
 class Section(pydantic.BaseModel):
     """Base of settings: frozen; unknown keys and non-finite numbers are errors."""
 
-    model_config = pydantic.ConfigDict(
+    model_config: ClassVar[pydantic.ConfigDict] = pydantic.ConfigDict(
         frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
     )
 

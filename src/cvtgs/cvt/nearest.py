@@ -121,7 +121,16 @@ def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m
 def nearest_several(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
-    """Return the nearest sites of every point and their distances, by a k-d tree on the host."""
+    """Find the nearest sites of every point, by a k-d tree on the host.
+
+    Args:
+        points: The points.
+        sites: The sites.
+        count: Number of sites to find, if there are as many.
+
+    Returns:
+        Rows of the sites, nearest first, and their distances.
+    """
     apart = _apart(sites.cpu())
     more = apart.shape[1] - points.shape[1]
     padded = torch.nn.functional.pad(points.cpu().double(), (0, more))

@@ -111,14 +111,31 @@ def tessellate(
 
 
 def choose_search(*, has_duplicates: bool) -> NearestSite:
-    """Choose the nearest-site search."""
+    """Choose the nearest-site search.
+
+    Args:
+        has_duplicates: Whether many points coincide; each position is then searched once.
+
+    Returns:
+        The search.
+    """
     return search_once_per_position(nearest_scipy) if has_duplicates else nearest_scipy
 
 
 def choose_seeds(
     weights: Float[Tensor, "n"], count: int, *, config: TessellationConfig, seed: int
 ) -> Int[Tensor, "m"]:
-    """Choose the points at which the sites start."""
+    """Choose the points at which the sites start.
+
+    Args:
+        weights: Weights of the points, in the order of a Morton curve.
+        count: Number of sites.
+        config: The settings; ``seeding`` is used.
+        seed: Seed of the random numbers, if ``seeding`` draws any.
+
+    Returns:
+        Rows of the points.
+    """
     if config.seeding == "weighted":
         return weighted_seeds(weights, count, torch.Generator().manual_seed(seed))
     return stratified_seeds(weights, count)[0]
@@ -127,7 +144,16 @@ def choose_seeds(
 def sample_points(
     points: Float[Tensor, "n d"], weights: Float[Tensor, "n"], size: int
 ) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k"]]:
-    """Return a weighted sample that represents all points, or all if it saves less than half."""
+    """Take a weighted sample that represents all points, or all if it saves less than half.
+
+    Args:
+        points: The points.
+        weights: Their weights.
+        size: Wanted number of points, raised to a minimum; 0 takes all.
+
+    Returns:
+        The points of the sample, and their weights.
+    """
     enough = max(size, MIN_SAMPLES)
     if size == 0 or enough >= len(points) // 2:
         return points, weights
@@ -244,7 +270,17 @@ def weighted_sums(
     labels: Int[Tensor, "n"],
     count: int,
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m d"]]:
-    """Return the sums of weights and of weighted points per label, in float64."""
+    """Sum weights and weighted points per label, in float64.
+
+    Args:
+        points: The points.
+        weights: Their weights.
+        labels: Label of each point.
+        count: Number of labels.
+
+    Returns:
+        Sums of the weights, and of the points times their weights.
+    """
     weights = weights.double()
     columns = [weights, *(column.double() * weights for column in points.unbind(1))]
     sums = label_sums(columns, labels, count)
@@ -254,7 +290,16 @@ def weighted_sums(
 def centroids(
     totals: Float[Tensor, "m"], sums: Float[Tensor, "m d"], fallback: Float[Tensor, "m d"]
 ) -> Float[Tensor, "m d"]:
-    """Divide the sums by the total weights; labels without weight return ``fallback``."""
+    """Divide sums by total weights.
+
+    Args:
+        totals: Total weight of each label.
+        sums: Sums of weighted points (:func:`weighted_sums`).
+        fallback: Values of labels without weight.
+
+    Returns:
+        The centroid of each label.
+    """
     filled = totals > 0
     means = sums / totals.where(filled, 1.0)[:, None]
     return torch.where(filled[:, None], means, fallback)

@@ -7,8 +7,8 @@ after changing a function that kernels in other files call, clear the cache.
 """
 
 import threading
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from functools import wraps
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -58,14 +58,14 @@ def serial(function: F) -> F:
 def parallel(function: F) -> F:
     """Compile a function whose outer loop runs over :data:`prange`; only Python may call it.
 
-    Without OpenMP and TBB, the threads of numba take one loop at a time, and end the process at a
-    second one; so threads of the program wait for each other there.
+    It uses as many threads as torch. Without OpenMP and TBB, the threads of numba take one loop at
+    a time and end the process at a second one; so threads of the program wait for each other there.
     """
     compiled = _compiled(function, **_SETTINGS, parallel=True)
 
     @wraps(function)
     def call(*arguments: Any) -> object:
-        with nullcontext() if _takes_several_loops() else _Turn.lock:
+        with nullcontext() if _takes_several_loops() else _Turn.lock, threads_of_torch():
             return compiled(*arguments)
 
     return cast("F", call)
@@ -91,16 +91,22 @@ def _compiled(function: F, **settings: Any) -> F:
         return cast("F", numba.njit(**settings | {"cache": False})(function))
 
 
-def use_threads_of_torch() -> None:
+@contextmanager
+def threads_of_torch() -> Iterator[None]:
     """Make compiled functions called from this thread use as many threads as torch.
 
     Where both share an OpenMP library, numba also changes the number for torch when it starts its
     threads, so this restores it.
     """
     count, most = torch.get_num_threads(), vars(numba.config)["NUMBA_NUM_THREADS"]
+    before = numba.get_num_threads()
     numba.set_num_threads(max(1, min(count, most)))
     if torch.get_num_threads() != count:
         torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
 
 
 class GaussianArrays(NamedTuple):

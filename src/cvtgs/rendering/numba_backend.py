@@ -14,13 +14,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.rendering.backends import RasterOutput, render_each
-from cvtgs.rendering.compiled import (
-    GaussianArrays,
-    RasterSettings,
-    SplatArrays,
-    TileArrays,
-    use_threads_of_torch,
-)
+from cvtgs.rendering.compiled import GaussianArrays, RasterSettings, SplatArrays, TileArrays
 from cvtgs.rendering.kernels_blending import composite_all, composite_all_gradient
 from cvtgs.rendering.kernels_projection import project_all, project_all_gradient
 from cvtgs.rendering.kernels_tiles import count_tiles, sort_by_tile, write_tiles
@@ -58,7 +52,6 @@ def rasterize(
     Memory: ``11 n`` numbers for n Gaussians, ``12 p`` bytes for p intersections of splats and
     tiles, and the image. The backward pass needs ``10 p`` numbers at a time.
     """
-    use_threads_of_torch()
     tensors = [tensor.contiguous() for tensor in scene.tensors().values()]
     images = [
         partial(_Render.apply, _settings(camera, sh_degree, scene), *tensors)
@@ -101,7 +94,6 @@ def blending_weights(scene: GaussianScene, camera: Cameras) -> TileWeights:
 
 
 def _arrays(scene: GaussianScene) -> GaussianArrays:
-    use_threads_of_torch()
     tensors = scene.tensors().values()
     return GaussianArrays(*(tensor.detach().contiguous().numpy() for tensor in tensors))
 
@@ -123,7 +115,6 @@ class _Render(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        use_threads_of_torch()
         image, *arrays = (tensor.detach().numpy() for tensor in ctx.saved_tensors)
         gaussians = GaussianArrays(*arrays)
         per_intersection = np.zeros((len(ctx.tiles.lists), 10), image.dtype)
