@@ -18,6 +18,7 @@ from cvtgs.cli.simplify import check_goals
 from cvtgs.cli.time_budget import STARTED, choose_preset, read_seconds
 from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.progress import silent
+from cvtgs.text import counted
 
 MODEL = CostModel(rates={"check": {"in": 1e-6}, "refine": {"look_pixels": 2.5e-7}})
 
@@ -191,7 +192,7 @@ def test_a_target_is_searched_and_reported(source, capsys, shown):
     small = simplified(source, "--target-psnr", "15")
     lines = capsys.readouterr().out.splitlines()
     text = " ".join(" ".join(lines).split())
-    assert f"300 -> {len(small)} Gaussians, " in text
+    assert f"300 -> {counted(len(small), 'Gaussian')}, " in text
     assert len(small) < 300
     assert "over automatic views; found in" in text
     assert "tessellate" not in shown
