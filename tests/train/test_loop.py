@@ -174,6 +174,18 @@ def test_without_any_gain_the_untrained_network_is_kept(scenes, cache, tmp_path,
     assert float(kept.net.decoder.weight.abs().amax()) == 0.0
 
 
+def test_the_learning_rate_falls_once_or_twice():
+    def rates(*steps, **settings):
+        config = TrainConfig(learning_rate=0.4, restart_rate=0.2, **settings)
+        return [train_loop._learning_rate(config, step) for step in steps]
+
+    once = rates(0, 49, 500, 1000, steps=1000)
+    assert once == pytest.approx([0.008, 0.4 * 0.9941, 0.2, 0.0], abs=1e-5)
+    twice = rates(0, 500, 999, 1000, 1049, 1250, 1500, steps=1500, restart_step=1000)
+    assert twice[:2] == once[:1] + once[2:3]
+    assert twice[2:] == pytest.approx([0.0, 0.004, 0.2 * 0.97651, 0.1, 0.0], abs=1e-5)
+
+
 @pytest.mark.slow
 def test_a_training_may_start_from_a_checkpoint(scenes, cache, tmp_path):
     first, second = tmp_path / "a.safetensors", tmp_path / "b.safetensors"

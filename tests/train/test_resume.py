@@ -40,7 +40,7 @@ def _quick_curves(monkeypatch) -> None:
 
 def config_of(scenes: Path, **changes) -> TrainConfig:
     data = tiny_data(scenes, copies=1, ratios=(0.1, 0.05))
-    return tiny_config(data, steps=STEPS, **changes)
+    return tiny_config(data, **{"steps": STEPS} | changes)
 
 
 class PowerCutError(Exception):
@@ -177,6 +177,21 @@ def test_more_patience_lets_a_training_continue(scenes, cache, tmp_path, monkeyp
     stopped = run(config_of(scenes, patience=1), path, cache)
     assert [entry.step for entry in stopped.validations] == [0, 2]
     found = run(config_of(scenes), path, cache, resume=True)
+    assert repr(found.validations) == repr(wanted.validations)
+    first, second = load_checkpoint(path).net, load_checkpoint(whole).net
+    assert all(map(torch.equal, first.state_dict().values(), second.state_dict().values()))
+
+
+@pytest.mark.usefixtures("_quick_curves")
+@pytest.mark.slow
+def test_a_finished_training_goes_on_as_if_it_had_never_ended(scenes, cache, tmp_path):
+    whole, path = tmp_path / "whole.safetensors", tmp_path / "net.safetensors"
+    more = {"steps": 6, "restart_step": 4, "restart_rate": 1e-3}
+    wanted = run(config_of(scenes, **more), whole, cache)
+    run(config_of(scenes, steps=4), path, cache)
+    with pytest.raises(CheckpointError, match=r"another configuration \(steps differs\)"):
+        run(config_of(scenes, **more | {"restart_step": 3}), path, cache, resume=True)
+    found = run(config_of(scenes, **more), path, cache, resume=True)
     assert repr(found.validations) == repr(wanted.validations)
     first, second = load_checkpoint(path).net, load_checkpoint(whole).net
     assert all(map(torch.equal, first.state_dict().values(), second.state_dict().values()))

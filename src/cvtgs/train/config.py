@@ -103,6 +103,10 @@ class TrainConfig(Section):
         cases_per_step: Number of scenes, each at one ratio, whose gradients are averaged in a step.
             On a CPU, processes on all cores share them.
         learning_rate: Largest learning rate of AdamW; it falls to zero along a cosine.
+        restart_step: Step at which the learning rate rises again, to fall a second time until the
+            last step; 0 for one fall only. With its number of steps here, and more steps, a
+            finished training can be resumed.
+        restart_rate: Largest learning rate after the restart.
         width: Units of the layers for members and neighbours.
         cell_width: Units of the layers for cells.
         largest_growth: Largest change of a log scale; the published network has no limit.
@@ -131,6 +135,8 @@ class TrainConfig(Section):
     steps: Count = 6000
     cases_per_step: Count = 1
     learning_rate: float = pydantic.Field(default=5e-3, gt=0.0)
+    restart_step: int = pydantic.Field(default=0, ge=0)
+    restart_rate: float = pydantic.Field(default=1e-3, gt=0.0)
     width: Count = 48
     cell_width: Count = 96
     largest_growth: float = pydantic.Field(default=0.6, gt=0.0, le=3.0)
@@ -154,6 +160,14 @@ class TrainConfig(Section):
             raise ConfigError(
                 "loss: one of mse_weight, image_weight and ssim_weight must be above 0, found 0 "
                 "for all."
+            )
+        return self
+
+    @pydantic.model_validator(mode="after")
+    def _check_restart(self) -> Self:
+        if self.restart_step >= self.steps:
+            raise ConfigError(
+                f"restart_step must be below the {self.steps} steps, found {self.restart_step}."
             )
         return self
 

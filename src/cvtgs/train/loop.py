@@ -103,7 +103,8 @@ def train(
         config: The settings.
         files: Output files; checkpoint, state and curves are replaced during training.
         resume: Whether to resume from ``files.state`` if it exists. All settings but ``note`` and
-            ``patience``, the scenes and the start must be the same; their paths may differ.
+            ``patience``, the scenes and the start must be the same; their paths may differ. A
+            finished training goes on with ``restart_step`` at its end.
         device: Device to train on.
         listener: Called for each prepared scene and each step.
         on_validation: Called after each validation.
@@ -245,8 +246,13 @@ def _step(
 
 
 def _learning_rate(config: TrainConfig, step: int) -> float:
-    warm = min(1.0, (step + 1) / WARM_UP)
-    return config.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / config.steps))
+    largest, first, end = config.learning_rate, 0, config.steps
+    if step >= config.restart_step > 0:
+        largest, first = config.restart_rate, config.restart_step
+    elif config.restart_step > 0:
+        end = config.restart_step
+    warm = min(1.0, (step - first + 1) / WARM_UP)
+    return largest * warm * 0.5 * (1 + math.cos(math.pi * (step - first) / (end - first)))
 
 
 def _validate(

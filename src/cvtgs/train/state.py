@@ -229,13 +229,18 @@ class TrainState:
             ) from error
 
     def _check_settings(self, path: Path, theirs: dict[str, Any], config: TrainConfig) -> None:
-        """Raise an error for other settings, which names the first one that differs."""
+        """Raise an error for other settings, which names the first one that differs.
+
+        A finished training may go on with a restart at its end: until there, both are the same.
+        """
         ours = _fingerprint(config, self.start)
         if set(theirs) != set(ours):
             raise CheckpointError(
                 f"{path}: the state was written by another version of cvtgs, which has other "
                 f"settings; remove it, or train to another output."
             )
+        if theirs["restart_step"] == 0 and ours["restart_step"] == theirs["steps"]:
+            theirs = theirs | {key: ours[key] for key in ("steps", "restart_step", "restart_rate")}
         odd = [key for key in ours if theirs[key] != ours[key]]
         if odd:
             raise CheckpointError(
