@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.math.eigen import symmetric_eigen
+
 OPACITY_MARGIN = 1e-6
 """Opacities stay this far from 0 and from 1."""
 
@@ -322,7 +324,7 @@ def decompose_covariances(
     """
     tiny = torch.finfo(covariances.dtype).tiny
     size = covariances.diagonal(dim1=1, dim2=2).amax(dim=1).clamp_min(tiny)
-    values, axes = torch.linalg.eigh(covariances / size[:, None, None])
+    values, axes = symmetric_eigen(covariances / size[:, None, None])
     values, axes = values.flip(-1), axes.flip(-1)
     values = torch.maximum(values, EIGENVALUE_FLOOR * values[:, :1].clamp_min(EIGENVALUE_FLOOR))
     scales = values.sqrt() * size.sqrt()[:, None]
