@@ -31,7 +31,7 @@ class Case(NamedTuple):
 
     @property
     def cells(self) -> Tensor:
-        return torch.arange(len(self.part))
+        return torch.arange(len(self.part), device=self.neighbors.device)
 
     def describe(self) -> Descriptors:
         return describe_cells(

@@ -18,6 +18,7 @@ from cvtgs.devices import (
     device_name,
     in_chunks,
     in_threads,
+    kernel_threads,
     move_together,
     one_thread,
     thread_count,
@@ -66,12 +67,12 @@ def test_auto_is_cuda_for_data_on_the_cpu(monkeypatch, has_cuda, home, found):
     assert chosen_device("auto", home) == torch.device(found)
 
 
-@pytest.mark.parametrize(("gigabytes", "factor"), [(0.1, 1), (2, 8), (8, 32), (80, 32)])
+@pytest.mark.parametrize(("gigabytes", "factor"), [(0.1, 1), (2, 4), (8, 16), (80, 128)])
 def test_chunks_are_longer_where_launches_are_expensive(monkeypatch, gigabytes, factor):
     found = SimpleNamespace(total_memory=int(gigabytes * 2**30))
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: found)
     assert chunk_length(7, torch.device("cpu")) == 7
-    assert chunk_length(7, torch.device("meta")) == 224
+    assert chunk_length(7, torch.device("meta")) == 896
     assert chunk_length(7, torch.device("cuda")) == 7 * factor
 
 
@@ -94,10 +95,10 @@ def test_running_out_of_memory_leads_to_short_chunks_then_the_cpu(may_leave):
         with pytest.raises(OutOfMemoryError, match="a test needs more memory than meta has"):
             within_memory(compute, there, work="a test", may_leave=False)
     assert tried[:2] == [
-        ("meta", 32, ""),
+        ("meta", 128, ""),
         ("meta", 1, "meta ran out of memory; computed there in short chunks"),
     ]
-    assert chunk_length(1, there) == 32
+    assert chunk_length(1, there) == 128
     assert len(tried) == 2 + may_leave
 
 
@@ -172,6 +173,19 @@ def test_chunks_are_computed_by_one_thread_each_and_stay_in_order(two_threads):
     assert torch.get_num_threads() == 2
 
 
+def test_one_thread_leaves_its_threads_to_kernels(two_threads):
+    assert kernel_threads() == 2
+    with one_thread():
+        assert (torch.get_num_threads(), kernel_threads()) == (1, 2)
+        with one_thread():
+            assert kernel_threads() == 2
+    found = list(in_threads(lambda _: kernel_threads(), range(4), HOST))
+    assert found == [1] * 4
+    torch.set_num_threads(1)
+    with one_thread():
+        assert kernel_threads() == 1
+
+
 def test_one_thread_computes_in_the_calling_thread():
     with one_thread():
         found = in_threads(lambda _: threading.get_ident(), range(3), torch.device("cpu"))
@@ -182,8 +196,8 @@ def test_ranges_of_rows_cover_all_rows_once_and_an_empty_table_is_one_range():
     found = in_chunks(lambda part: (part.start, part.stop), 5, 2, HOST)
     assert found == [(0, 2), (2, 4), (4, 5)]
     assert in_chunks(lambda part: (part.start, part.stop), 0, 2, HOST) == [(0, 0)]
-    there = in_chunks(lambda part: part.stop, 100, 2, torch.device("meta"))  # longer chunks
-    assert there == [64, 100]
+    there = in_chunks(lambda part: part.stop, 300, 2, torch.device("meta"))  # longer chunks
+    assert there == [256, 300]
 
 
 @pytest.mark.slow

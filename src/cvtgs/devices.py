@@ -18,10 +18,10 @@ from torch.nn.functional import pad
 
 from cvtgs.errors import DeviceError, OutOfMemoryError, is_out_of_memory
 
-LONGER_CHUNKS = 32
+LONGER_CHUNKS = 128
 """Maximum length of a chunk on other devices, as a multiple of its length on a CPU."""
 
-CHUNK_BYTES = 1 << 28
+CHUNK_BYTES = 1 << 29
 """Device memory to reserve per chunk of CPU length, which takes at most a quarter of it."""
 
 HOST = torch.device("cpu")
@@ -35,9 +35,10 @@ _SHORT_CHUNKS = ContextVar("short_chunks", default=False)
 
 
 class _Own(threading.local):
-    """Whether the calling thread computes with one thread of torch."""
+    """Whether the calling thread computes with one thread of torch, and how many it has left."""
 
     is_limited = False
+    spare = 1
 
 
 class _Limits:
@@ -108,9 +109,9 @@ def chunk_length(length: int, device: torch.device) -> int:
     """Return the length of a chunk on a device, given its length on a CPU.
 
     A chunk that fits the caches of a CPU is too short for a GPU, where every chunk costs kernel
-    launches; it is 32 times as long there, or less on CUDA devices with less than 8 GiB. The length
-    depends on the total memory of the device, not on its free memory, so that the same device gives
-    the same bits. In the second attempt of :func:`within_memory`, it is that of a CPU.
+    launches; it is 128 times as long there, or less on CUDA devices with less than 64 GiB. The
+    length depends on the total memory of the device, not on its free memory, so that the same
+    device gives the same bits. In the second attempt of :func:`within_memory`, it is that of a CPU.
     """
     if device.type == "cpu" or _SHORT_CHUNKS.get():
         return length
@@ -294,9 +295,17 @@ def one_thread() -> Iterator[None]:
         yield
         return
     with _restored_threads() as before:
-        _OWN.is_limited = True
+        _OWN.is_limited, _OWN.spare = True, before
         _limit_own(before)
         try:
             yield
         finally:
-            _OWN.is_limited = False
+            _OWN.is_limited, _OWN.spare = False, 1
+
+
+def kernel_threads() -> int:
+    """Return the number of threads for loops whose results do not depend on it.
+
+    It is that of torch, or the one that :func:`one_thread` takes from torch.
+    """
+    return max(torch.get_num_threads(), _OWN.spare)

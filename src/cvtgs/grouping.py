@@ -12,7 +12,7 @@ from torch import Tensor
 from cvtgs import cells, cvt
 from cvtgs.analysis import SceneAnalysis
 from cvtgs.config import AllocationConfig, SimplifyConfig
-from cvtgs.devices import HOST, move_together
+from cvtgs.devices import move_together
 from cvtgs.filters import filter_rows
 from cvtgs.math.frames import RobustFrame, morton_order
 from cvtgs.scene import GaussianScene
@@ -172,7 +172,7 @@ def allocate(
     groups = members if is_own else cells.group_moments(members, labels, count)
     merged = torch.arange(count, device=labels.device)
     if count > target:
-        groups = cells.Moments(*move_together(groups, HOST))  # many small steps
+        groups = cells.Moments(*move_together(groups, cvt.search_device(labels.device)))
         neighbors = points.neighbors if is_own else None
         if neighbors is None:
             neighbors = cvt.nearest_neighbors(groups.means.T, config.neighbors)
@@ -299,12 +299,13 @@ def add_neighbors(ordered: OrderedRows, target: int, config: AllocationConfig) -
         config: Number of neighbours.
 
     Returns:
-        The same with neighbours, 48 bytes per Gaussian on the host, where pairs merge; unchanged if
+        The same with neighbours, 48 bytes per Gaussian, where pairs merge; unchanged if
         it has them or needs none.
     """
     points, total = ordered.points, len(ordered.filtered)
     from_singles = target < total and finer_count(target, total, config) == total
     if not from_singles or points.neighbors is not None or points.moments is None:
         return ordered
-    near = cvt.nearest_neighbors(points.moments.means.T.to(HOST), config.neighbors)
+    means = points.moments.means
+    near = cvt.nearest_neighbors(means.T.to(cvt.search_device(means.device)), config.neighbors)
     return ordered._replace(points=points._replace(neighbors=near))

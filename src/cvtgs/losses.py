@@ -1,6 +1,7 @@
 """Losses between rendered images and their targets."""
 
 import math
+from functools import cache
 
 import torch
 from jaxtyping import Float
@@ -87,10 +88,10 @@ def mean_ssim(
     of one stack of images, 30 with the gradient.
     """
     check_pair(prediction, target, least=SSIM_WINDOW)
-    from kornia.filters import filter2d_separable, get_gaussian_kernel1d  # noqa: PLC0415 (slow)
+    from kornia.filters import filter2d_separable  # noqa: PLC0415 (slow)
 
     x, y = (images.permute(0, 3, 1, 2) for images in (prediction, target))
-    kernel = get_gaussian_kernel1d(SSIM_WINDOW, SSIM_SIGMA, device=x.device, dtype=x.dtype)
+    kernel = _ssim_kernel(x.device, x.dtype)
     # One convolution of 15 channels is twice as fast as five of three, as in `kornia.metrics.ssim`.
     maps = torch.cat([x, y, x * x, y * y, x * y], dim=1)
     filtered = filter2d_separable(maps, kernel, kernel, padding="valid")
@@ -101,6 +102,14 @@ def mean_ssim(
     similarity: Tensor = (2 * product + low) * (2 * (xy - product) + high)
     similarity = similarity / ((square_x + square_y + low) * (variances + high))
     return similarity.mean(dim=(1, 2, 3))
+
+
+@cache
+def _ssim_kernel(device: torch.device, dtype: torch.dtype) -> Float[Tensor, "1 k"]:
+    from kornia.filters import get_gaussian_kernel1d  # noqa: PLC0415 (slow)
+
+    with torch.inference_mode(mode=False):
+        return get_gaussian_kernel1d(SSIM_WINDOW, SSIM_SIGMA, device=device, dtype=dtype)
 
 
 def gradient_loss(

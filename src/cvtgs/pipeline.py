@@ -155,7 +155,7 @@ def reduce_scene(
         refilled_cells=refilled,
         energies=energies,
         energy=energy,
-        backend=cvt.SEARCH,
+        backend=cvt.search_name(scene.device),
     )
     return Reduced(small, statistics, partition)
 

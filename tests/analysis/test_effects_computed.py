@@ -189,10 +189,10 @@ def test_duplicates_are_searched_once(monkeypatch):
     scene = random_scene(300).select(torch.arange(300).repeat(3))
     searched = []
     home = import_module("cvtgs.cvt.tessellate")
-    original = home.nearest_scipy
+    original = home.nearest_site
     monkeypatch.setattr(
         home,
-        "nearest_scipy",
+        "nearest_site",
         lambda points, sites: searched.append(len(points)) or original(points, sites),
     )
     settings = {

@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
@@ -193,13 +192,13 @@ def greedy(first, second, costs, wanted):
 def test_disjoint_pairs_equal_those_of_a_loop_over_all_pairs(kind, wanted):
     """Along a chain of ascending costs, a round finds one pair only, and a loop the rest."""
     g = torch.Generator().manual_seed(0)
-    first, second = (rows.numpy() for rows in torch.combinations(torch.arange(40)).T)
-    costs = torch.rand(len(first), generator=g).numpy()
+    first, second = torch.combinations(torch.arange(40)).T
+    costs = torch.rand(len(first), generator=g)
     if kind == "ties":
         costs = (4 * costs).round()
     if kind == "ascending":
-        first, second = np.arange(199), np.arange(1, 200)
-        costs = np.arange(199, dtype=np.float32)
+        first, second = torch.arange(199), torch.arange(1, 200)
+        costs = torch.arange(199.0)
     take = merge_pairs.__globals__["_cheapest_disjoint"]
     found = take(first, second, costs, wanted, 200)
     pairs = list(zip(*(ends.tolist() for ends in found), strict=True))
@@ -208,7 +207,7 @@ def test_disjoint_pairs_equal_those_of_a_loop_over_all_pairs(kind, wanted):
 
 def test_each_pair_appears_once_in_ascending_order():
     pairs_of = merge_pairs.__globals__["_distinct_pairs"]
-    first, second = np.array([4, 2, 9, 2, 3, 0]), np.array([2, 4, 0, 9, 3, 9])
+    first, second = torch.tensor([4, 2, 9, 2, 3, 0]), torch.tensor([2, 4, 0, 9, 3, 9])
     keys = pairs_of(first, second)
     assert [(key >> 32, key % 2**32) for key in keys.tolist()] == [(0, 9), (2, 4), (2, 9)]
     assert len(pairs_of(first[:0], first[:0])) == 0

@@ -162,7 +162,7 @@ def test_simplify_and_levels_accept_axes(tmp_path: Path) -> None:
     two = ["levels", str(tmp_path / "a.spz"), "-o", str(tmp_path / "levels"), "--rho", "0.0667"]
     assert main([*two, *words, "--no-scores", "--ckpt", "none"]) == 0
     (level,) = (tmp_path / "levels").glob("*.ply")
-    one = Simplifier(None, device="cpu").levels(load(tmp_path / "plain.ply"), [0.0667])[0]
+    one = Simplifier(None).levels(load(tmp_path / "plain.ply"), [0.0667])[0]
     assert same_bits(load(level, axes="luf"), one.scene)
 
 

@@ -55,7 +55,7 @@ def test_doctor_reports_a_working_machine(capsys):
     used = "numba" if version_of("numba") != "not installed" else "torch"
     assert f"images by {used:<7} yes (used: the fastest that works here)\n" in printed
     assert printed.count("(used: the fastest") == 1
-    assert "nearest site by scipy (a k-d tree on the host" in printed
+    assert "nearest sites by scipy (a k-d tree on the host)" in printed
     assert "300 generated Gaussians to 10%" in printed
     for step in ("generate", "simplify", "views", "render"):
         assert f"  {step} " in printed

@@ -50,7 +50,7 @@ def made(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("made")
     write_scenes(folder / "scenes", ["exam", "lesson"])
     words = ["train", str(write_config(folder)), "-o", str(folder / "net.safetensors"), "--quiet"]
-    assert main(words) == 0
+    assert main([*words, "--device", "cpu"]) == 0
     return folder
 
 
@@ -58,7 +58,7 @@ def made(tmp_path_factory) -> Path:
 def again(made, tmp_path) -> list[str]:
     """The arguments of the same training with another output and the existing cache."""
     words = ["train", str(made / "tiny.toml"), "-o", str(tmp_path / "net.safetensors")]
-    return [*words, "--cache", str(made / "net.cache")]
+    return [*words, "--cache", str(made / "net.cache"), "--device", "cpu"]
 
 
 @pytest.mark.slow

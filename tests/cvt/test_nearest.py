@@ -8,8 +8,15 @@ import torch
 
 import oracles
 from cvtgs.cvt import nearest_neighbors, nearest_scipy
+from cvtgs.cvt.device_search import nearest_in_tiles
 
-BACKENDS = {"scipy": nearest_scipy}
+
+def nearest_by_tiles(points, sites):
+    labels, squared = nearest_in_tiles(points, sites)
+    return labels[:, 0], squared[:, 0]
+
+
+BACKENDS = {"scipy": nearest_scipy, "tiles": nearest_by_tiles}
 both = pytest.mark.parametrize("backend", BACKENDS.values(), ids=BACKENDS)
 dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 

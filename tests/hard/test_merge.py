@@ -40,7 +40,7 @@ def case_of_cells(scene, device) -> Case:
         return case
     part = case.part.to(torch.device(device))
     there = case.neighbors.to(device), case.visibility.to(device)
-    return Case(scene.to(device), case.merged.to(device), part, *there)
+    return Case(scene.to(device), case.merged.to(device), part, *there, case.pixel_size)
 
 
 @dtypes

@@ -219,6 +219,7 @@ def test_cuda_gives_the_same_gaussians(dtype, tolerance):
         Partition(order=case.part.order.cuda(), offsets=case.part.offsets.cuda()),
         case.neighbors.cuda(),
         case.visibility.cuda(),
+        case.pixel_size,
     )
     first, second = (there.correct(lively_net(dtype).cuda()) for _ in "ab")
     assert first.device.type == "cuda"

@@ -228,7 +228,7 @@ def test_huge_gaussians_have_finite_units(log_scale):
 def test_seeds_are_whole_numbers_of_any_type():
     full = full_scene()
     small = discolored(full)
-    options = {"steps": 2, "config": quick()}
+    options = {"steps": 2, "config": quick(), "device": "cpu"}
     wanted = refine(small, full, seed=3, **options).scene
     assert same_bits(refine(small, full, seed=np.int64(3), **options).scene, wanted)
     for seed in (None, 0.5, "0"):

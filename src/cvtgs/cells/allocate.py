@@ -9,13 +9,12 @@ import math
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.analysis import far_share
 from cvtgs.cells.moments import UPPER, Moments
 from cvtgs.config import AllocationConfig
-from cvtgs.devices import HOST, in_chunks
+from cvtgs.devices import in_chunks
 from cvtgs.math.segments import label_argmin, take_columns
 
 CHUNK = 1 << 14
@@ -49,9 +48,6 @@ MOST_ROUNDS = 30
 ROW_BITS, LAST_ROW = 32, (1 << 32) - 1
 """Keys to sort by have a row number in their lower bits."""
 
-Rows = NDArray[np.int64]
-"""Row numbers or keys."""
-
 
 def merge_pairs(
     groups: Moments, neighbors: Int[Tensor, "m k"], count: int, config: AllocationConfig
@@ -65,8 +61,8 @@ def merge_pairs(
     at a wide angle cost more.
 
     Args:
-        groups: Moments of the groups, on the CPU.
-        neighbors: Groups that each group may merge with, on the CPU.
+        groups: Moments of the groups.
+        neighbors: Groups that each group may merge with.
         count: Number of groups to keep, 1 to m.
         config: Weights of the cost.
 
@@ -82,28 +78,28 @@ def merge_pairs(
     }
     config = config.model_copy(update=update)
     table = torch.cat([torch.atleast_2d(values).float() for values in groups])  # fast to gather
-    total = len(groups.masses)
-    labels = np.arange(total, dtype=np.int64)  # numpy 1 on Windows would take 32 bits
-    pairs = _distinct_pairs(labels.repeat(neighbors.shape[1]), neighbors.numpy().ravel())
+    total, device = len(groups.masses), groups.masses.device
+    labels = torch.arange(total, device=device)
+    pairs = _distinct_pairs(labels.repeat_interleave(neighbors.shape[1]), neighbors.flatten())
     while total > count:
         if len(pairs) == 0:  # no neighbouring pairs are left: merge arbitrary ones
-            rows = np.arange(total, dtype=np.int64)
+            rows = torch.arange(total, device=device)
             pairs = _distinct_pairs(rows[:-1], rows[1:])
         first, second = pairs >> ROW_BITS, pairs & LAST_ROW
         wanted = min(total - count, max(1, int(SHARE_PER_ROUND * total)))
-        costs = _pair_costs(table, torch.from_numpy(first), torch.from_numpy(second), config)
-        kept, merged = _cheapest_disjoint(first, second, costs.numpy(), wanted, total)
-        is_kept = np.ones(total, dtype=bool)
+        costs = _pair_costs(table, first, second, config)
+        kept, merged = _cheapest_disjoint(first, second, costs, wanted, total)
+        is_kept = torch.ones(total, dtype=torch.bool, device=device)
         is_kept[merged] = False
-        target = np.cumsum(is_kept, dtype=np.int64) - 1
+        target = is_kept.cumsum(0) - 1
         target[merged] = target[kept]
-        labels, total = target[labels], total - len(merged)
+        labels, total = target.index_select(0, labels), total - len(merged)
         if total > count:
             _join_pairs(table, kept, merged)
-            table = table.index_select(1, torch.from_numpy(np.flatnonzero(is_kept)))
+            table = table.index_select(1, is_kept.nonzero()[:, 0])
             del pairs, costs  # frees memory
-            pairs = _distinct_pairs(target[first], target[second])
-    return torch.from_numpy(labels)
+            pairs = _distinct_pairs(target.index_select(0, first), target.index_select(0, second))
+    return labels
 
 
 def _relative_contrast(colors: Float[Tensor, "3 m"], neighbors: Int[Tensor, "m k"]) -> float:
@@ -111,27 +107,24 @@ def _relative_contrast(colors: Float[Tensor, "3 m"], neighbors: Int[Tensor, "m k
 
     The contrast is the root of half the mean squared difference of their colours, in a sample.
     """
-    values, rows = colors.numpy(), np.arange(0, len(neighbors), 1 + len(neighbors) // SAMPLE)
-    near = neighbors.numpy()[rows]
-    squares = np.square(values[:, near] - values[:, rows, None]).sum()  # numpy uses one thread
-    contrast = math.sqrt(0.5 * float(squares) / max(1, near.size)) / COMMON_CONTRAST
+    rows = torch.arange(0, len(neighbors), 1 + len(neighbors) // SAMPLE, device=colors.device)
+    near = neighbors.index_select(0, rows)
+    steps = (colors[:, near] - colors.index_select(1, rows)[:, :, None]).cpu().numpy()
+    squares = np.square(steps).sum()  # in one order on any device; numpy uses one thread
+    contrast = math.sqrt(0.5 * float(squares) / max(1, near.numel())) / COMMON_CONTRAST
     return min(max(contrast, LEAST_CONTRAST), LARGEST_CONTRAST)
 
 
-def _distinct_pairs(first: Rows, second: Rows) -> Rows:
+def _distinct_pairs(first: Int[Tensor, "p"], second: Int[Tensor, "p"]) -> Int[Tensor, "q"]:
     """Return a key of each unordered pair of different groups, ascending.
 
     The upper bits of a key are the smaller of the two groups, the lower ones the other.
     """
-    keys = np.minimum(first, second)
-    keys <<= ROW_BITS
-    keys |= np.maximum(first, second)
-    keys = keys[first != second]
-    keys.sort()
-    is_new = np.ones(len(keys), dtype=bool)
-    np.not_equal(keys[1:], keys[:-1], out=is_new[1:])
-    distinct: Rows = keys[is_new]
-    return distinct
+    keys = (torch.minimum(first, second) << ROW_BITS).bitwise_or_(torch.maximum(first, second))
+    keys = torch.sort(keys.index_select(0, (first != second).nonzero()[:, 0])).values
+    is_new = torch.ones(len(keys), dtype=torch.bool, device=keys.device)
+    torch.ne(keys[1:], keys[:-1], out=is_new[1:])
+    return keys.index_select(0, is_new.nonzero()[:, 0])
 
 
 def _take(table: Float[Tensor, "c n"], groups: Int[Tensor, "k"]) -> Moments:
@@ -161,7 +154,7 @@ def _pair_costs(
         cost *= one.counts + two.counts
         return cost[0].nan_to_num_(torch.inf, torch.inf).clamp_min_(0.0)
 
-    return torch.cat(in_chunks(costs_of, len(first), CHUNK, HOST))
+    return torch.cat(in_chunks(costs_of, len(first), CHUNK, table.device))
 
 
 def _fog_factor(
@@ -190,9 +183,8 @@ def _joint_covariances(
     ])  # fmt: skip
 
 
-def _join_pairs(table: Float[Tensor, "c n"], kept: Rows, merged: Rows) -> None:
-    """Replace the moments of kept groups by those of them and the merged ones, in place."""
-    first, second = torch.from_numpy(kept), torch.from_numpy(merged)
+def _join_pairs(table: Float[Tensor, "c n"], first: Int[Tensor, "k"], second: Tensor) -> None:
+    """Replace the moments of the first groups by those of both of each pair, in place."""
 
     def join(part: slice) -> None:
         one, two = _take(table, first[part]), _take(table, second[part])
@@ -209,7 +201,7 @@ def _join_pairs(table: Float[Tensor, "c n"], kept: Rows, merged: Rows) -> None:
         )
         table.index_copy_(1, first[part], torch.cat(both))
 
-    in_chunks(join, len(kept), CHUNK, HOST)
+    in_chunks(join, len(first), CHUNK, table.device)
 
 
 def _log_volume(covariances: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:
@@ -224,8 +216,12 @@ def _log_volume(covariances: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:
 
 
 def _cheapest_disjoint(
-    first: Rows, second: Rows, costs: NDArray[np.float32], wanted: int, total: int
-) -> tuple[Rows, Rows]:
+    first: Int[Tensor, "p"],
+    second: Int[Tensor, "p"],
+    costs: Float[Tensor, "p"],
+    wanted: int,
+    total: int,
+) -> tuple[Int[Tensor, "k"], Int[Tensor, "k"]]:
     """Take disjoint pairs, cheapest first, at most ``wanted``; return them in the order of pairs.
 
     Each round takes every pair that is the cheapest of both its groups. The result is that of a
@@ -233,31 +229,44 @@ def _cheapest_disjoint(
     ascending costs there would be as many rounds as pairs, so a loop finishes what is left.
     """
     # Bits of positive floats are in the order of the floats, so these keys are in that of costs.
-    keys = costs.view(np.int32).astype(np.int64)
-    keys <<= ROW_BITS
-    keys |= np.arange(len(keys))
-    left, is_free = (first, second), np.ones(total, dtype=bool)
-    taken: list[Rows] = []
+    keys = costs.view(torch.int32).long() << ROW_BITS
+    keys |= torch.arange(len(keys), device=keys.device)
+    left, is_free = [first, second], torch.ones(total, dtype=torch.bool, device=keys.device)
+    taken: list[Tensor] = []
     for _ in range(MOST_ROUNDS):
-        least = np.full(total, np.iinfo(np.int64).max)
+        least = torch.full((total,), torch.iinfo(torch.int64).max, device=keys.device)
         for groups in left:
-            np.minimum.at(least, groups, keys)
-        is_chosen = (least[left[0]] == keys) & (least[left[1]] == keys)
-        taken.append(keys[is_chosen])
+            least.scatter_reduce_(0, groups, keys, "amin")
+        cheapest = [least.index_select(0, groups) == keys for groups in left]
+        chosen = (cheapest[0] & cheapest[1]).nonzero()[:, 0]
+        taken.append(keys.index_select(0, chosen))
         for groups in left:
-            is_free[groups[is_chosen]] = False
-        stays = np.flatnonzero(is_free[left[0]] & is_free[left[1]])
-        left, keys = (left[0][stays], left[1][stays]), keys[stays]
+            is_free[groups.index_select(0, chosen)] = False
+        free = [is_free.index_select(0, groups) for groups in left]
+        stays = (free[0] & free[1]).nonzero()[:, 0]
+        *left, keys = (values.index_select(0, stays) for values in (*left, keys))
         if len(keys) == 0:
             break
-    order, free, late = np.argsort(keys), bytearray(is_free), list[int]()
-    for key, i, j in zip(*(values[order].tolist() for values in (keys, *left)), strict=True):
+    taken.append(_greedy_pass(left[0], left[1], keys, is_free))
+    found = torch.sort(torch.cat(taken)).values
+    rows = torch.sort(found[:wanted] & LAST_ROW).values
+    return first.index_select(0, rows), second.index_select(0, rows)
+
+
+def _greedy_pass(
+    first: Int[Tensor, "p"], second: Int[Tensor, "p"], keys: Int[Tensor, "p"], is_free: Tensor
+) -> Int[Tensor, "k"]:
+    """Take disjoint pairs of free groups in the order of their keys, one by one."""
+    if len(keys) == 0:
+        return keys
+    ascending, order = torch.sort(keys)
+    columns = torch.stack([ascending, first[order], second[order]]).tolist()
+    free, taken = bytearray(is_free.cpu().numpy()), list[int]()
+    for key, i, j in zip(*columns, strict=True):
         if free[i] and free[j]:
             free[i] = free[j] = 0
-            late.append(key)
-    found = np.sort(np.concatenate([*taken, np.array(late, dtype=np.int64)]))
-    rows = np.sort(found[:wanted] & LAST_ROW)
-    return first[rows], second[rows]
+            taken.append(key)
+    return torch.tensor(taken, dtype=torch.int64, device=keys.device)
 
 
 def reassign(

@@ -22,6 +22,12 @@ BACKENDS = ("torch", "numpy", "scipy", "numba", "gsplat")
 """The packages that cvtgs computes with; the last two are optional."""
 
 RENDERERS = ("torch", "numba", "gsplat")
+SEARCHES = {
+    "scipy": "scipy (a k-d tree on the host)",
+    "tiles": "tiles (dense distances on the device)",
+}
+"""What each search for the nearest sites is."""
+
 COUNT, RHO, SIDE = 20_000, 0.1, 256
 """The small run: Gaussians, ratio, and side of the square image in pixels."""
 
@@ -91,7 +97,7 @@ def doctor(options: argparse.Namespace) -> None:
         for name in RENDERERS:
             use = " (used: the fastest that works here)" if name == taken else ""
             say(f"  images by {name:<7} {_renderer_state(name, one)}{use}")
-        say(f"  nearest site by {cvtgs.cvt.SEARCH} (a k-d tree on the host, whatever the device)")
+        say(f"  nearest sites by {SEARCHES[cvtgs.cvt.search_name(one)]}")
     if options.device == "auto" and not gpus:
         say("\ncuda: not available")
     say(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one image")

@@ -2,11 +2,13 @@
 
 from cvtgs.cvt.embedding import embed, gaussian_weights, tessellation_weights
 from cvtgs.cvt.nearest import (
-    SEARCH,
     NearestSite,
     nearest_neighbors,
     nearest_scipy,
     nearest_several,
+    nearest_site,
+    search_device,
+    search_name,
 )
 from cvtgs.cvt.tessellate import (
     LloydResult,
@@ -24,7 +26,6 @@ from cvtgs.cvt.tessellate import (
 )
 
 __all__ = [
-    "SEARCH",
     "LloydResult",
     "NearestSite",
     "Tessellation",
@@ -38,7 +39,10 @@ __all__ = [
     "nearest_neighbors",
     "nearest_scipy",
     "nearest_several",
+    "nearest_site",
     "sample_points",
+    "search_device",
+    "search_name",
     "stratified_seeds",
     "tessellate",
     "tessellation_weights",

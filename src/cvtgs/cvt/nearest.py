@@ -1,4 +1,4 @@
-"""Nearest sites and neighbours, by scipy's k-d tree on the host."""
+"""Nearest sites and neighbours: by scipy's k-d tree on the host, or in tiles on CUDA."""
 
 import math
 from collections.abc import Callable
@@ -10,12 +10,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.devices import thread_count
+from cvtgs.cvt.device_search import nearest_in_tiles
+from cvtgs.devices import HOST, thread_count
 from cvtgs.math.frames import robust_frame
 from cvtgs.math.segments import ascending_rows
-
-SEARCH = "scipy"
-"""Name of the nearest-site search, for reports."""
 
 NearestSite = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Maps points ``(n, d)`` and sites ``(m, d)`` to labels and squared distances ``(n,)``."""
@@ -25,6 +23,39 @@ CHUNK = 1 << 15
 
 TINY_SHIFT = 1e-9
 """Coincident sites are separated by at most this share of the robust radius of all sites."""
+
+
+def search_device(device: torch.device) -> torch.device:
+    """Return where the sites nearest to points of a device are searched: there, or on the host."""
+    return device if device.type == "cuda" else HOST
+
+
+def search_name(device: torch.device) -> str:
+    """Return the name of the search on a device, for reports."""
+    return "tiles" if device.type == "cuda" else "scipy"
+
+
+def nearest_site(
+    points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"]
+) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
+    """Find the nearest site of every point, on CUDA if they are there, else on the host.
+
+    Args:
+        points: Positions on any device.
+        sites: Positions on the same device, at least one.
+
+    Returns:
+        Labels and squared distances in float64. Ties may be resolved in any way.
+
+    Example:
+        >>> labels, squared = nearest_site(torch.tensor([[0.9]]), torch.tensor([[0.0], [1.0]]))
+        >>> labels.tolist()
+        [1]
+    """
+    if points.device.type != "cuda":
+        return nearest_scipy(points, sites)
+    labels, squared = nearest_in_tiles(points, sites)
+    return labels[:, 0], squared[:, 0]
 
 
 def nearest_scipy(
@@ -93,7 +124,7 @@ def build_tree(sites: Float[Tensor, "m d"]) -> Any:
 
 
 def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m k"]:
-    """Find the nearest other sites of every site with a k-d tree on the host.
+    """Find the nearest other sites of every site, on CUDA if they are there, else on the host.
 
     Args:
         sites: Positions on any device.
@@ -108,10 +139,13 @@ def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m
         [[1], [0], [1]]
     """
     with_self = min(count + 1, len(sites))
-    apart = _apart(sites.cpu())
-    rows, _ = _by_tree(apart, apart, with_self)
+    if sites.device.type == "cuda":
+        rows, _ = nearest_in_tiles(sites, sites, with_self)
+    else:
+        apart = _apart(sites.cpu())
+        rows, _ = _by_tree(apart, apart, with_self)
     # With coincident sites, the site itself may be anywhere or missing: then drop the last one.
-    is_self = rows == torch.arange(len(sites), device="cpu")[:, None]
+    is_self = rows == torch.arange(len(sites), device=rows.device)[:, None]
     if bool(is_self[:, 0].all()):
         return rows[:, 1:].to(sites.device)
     others = torch.sort(is_self.to(torch.uint8), dim=1, stable=True).indices[:, : with_self - 1]
@@ -121,16 +155,19 @@ def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m
 def nearest_several(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
-    """Find the nearest sites of every point, by a k-d tree on the host.
+    """Find the nearest sites of every point, on CUDA if they are there, else on the host.
 
     Args:
         points: The points.
-        sites: The sites.
+        sites: The sites, on the same device.
         count: Number of sites to find, if there are as many.
 
     Returns:
         Rows of the sites, nearest first, and their distances.
     """
+    if sites.device.type == "cuda":
+        rows, squared = nearest_in_tiles(points, sites, min(count, len(sites)))
+        return rows, squared.sqrt()
     apart = _apart(sites.cpu())
     more = apart.shape[1] - points.shape[1]
     padded = torch.nn.functional.pad(points.cpu().double(), (0, more))

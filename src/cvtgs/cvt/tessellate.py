@@ -8,10 +8,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.config import TessellationConfig
-from cvtgs.cvt.nearest import NearestSite, nearest_scipy, search_once_per_position
-from cvtgs.devices import HOST, move_together
+from cvtgs.cvt.nearest import (
+    NearestSite,
+    nearest_site,
+    search_device,
+    search_once_per_position,
+)
+from cvtgs.devices import move_together
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.math.segments import label_argmin, label_sums, smallest_rows
+from cvtgs.math.segments import label_argmin, label_sums, running_sums, smallest_rows
 
 MIN_SAMPLES = 1 << 15
 """Smallest sample of points for Lloyd; fewer would save next to no time."""
@@ -23,7 +28,7 @@ class Tessellation:
 
     Attributes:
         labels: ``(n,)`` cell of every point, 0 to m - 1; every cell has a point.
-        sites: ``(m, d)`` sites that the labels refer to, on the CPU.
+        sites: ``(m, d)`` sites that the labels refer to, on the device of the search.
         energies: ``sum w |x - site|^2`` before every Lloyd iteration, over the points that Lloyd
             samples.
         energy: The same for the final labels, over all points.
@@ -80,13 +85,13 @@ def tessellate(
         own = torch.arange(count, device=home)
         return Tessellation(
             labels=own,
-            sites=points.double().cpu(),
+            sites=points.double(),
             energies=(0.0,),
             energy=0.0,
             refilled=0,
         )
     nearest = choose_search(has_duplicates=has_duplicates)
-    points, weights = move_together([points, weights], HOST)  # where the tree is
+    points, weights = move_together([points, weights], search_device(home))
     seeds = choose_seeds(weights, count, config=config, seed=seed)
     sample, sample_weights = sample_points(points, weights, config.samples_per_site * count)
     settled = lloyd(
@@ -119,7 +124,7 @@ def choose_search(*, has_duplicates: bool) -> NearestSite:
     Returns:
         The search.
     """
-    return search_once_per_position(nearest_scipy) if has_duplicates else nearest_scipy
+    return search_once_per_position(nearest_site) if has_duplicates else nearest_site
 
 
 def choose_seeds(
@@ -341,7 +346,7 @@ def stratified_seeds(
         certain[heavy[heaviest]] = True
     rows, others = certain.nonzero()[:, 0], (~certain).nonzero()[:, 0]
     if free:  # the middles of equal steps of accumulated weight
-        total = weights[others].cumsum(0)
+        total = running_sums(weights[others])
         middles = (torch.arange(free, device=weights.device) + 0.5) * (total[-1] / free)
         picks = torch.searchsorted(total, middles).clamp_max(len(others) - 1)
         # Weights below one step give distinct picks, except for rounding and zero weights:

@@ -175,7 +175,7 @@ def normalize_quats(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
         >>> normalize_quats(torch.tensor([[2.0, 0.0, 0.0, 0.0]])).tolist()
         [[1.0, 0.0, 0.0, 0.0]]
     """
-    largest = quats.abs().amax(dim=-1, keepdim=True)
+    largest = quats.detach().abs().amax(dim=-1, keepdim=True)  # has no effect on the result
     scaled = quats / largest
     return scaled / scaled.square().sum(dim=-1, keepdim=True).sqrt()
 

@@ -12,7 +12,7 @@ from cvtgs.cvt import (
     choose_search,
     choose_seeds,
     gaussian_weights,
-    nearest_scipy,
+    nearest_site,
     sample_points,
     weighted_sums,
 )
@@ -259,7 +259,7 @@ def _fill_empty(
     movable[stays[stays < len(points)]] = False
     while len(left):
         rows = movable.nonzero()[:, 0]
-        near, distances = nearest_scipy(sites[left], points[rows])
+        near, distances = nearest_site(sites[left], points[rows])
         several, numbers = torch.unique(near, return_inverse=True)
         closest = label_argmin(distances, numbers, len(several))  # a point for one site only
         moved = rows[several]

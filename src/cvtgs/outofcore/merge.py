@@ -144,7 +144,7 @@ def correct(job: Job, block: int) -> None:
         mass_out=float(small.masses.sum()),
         single_member_cells=shown.count_singles(),
         largest_cell=int(partition.counts.amax()),
-        backend=cvt.SEARCH,
+        backend=cvt.search_name(scene.device),
     )
     write_block(job, block, small, report)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cvtgs.analysis import ambient_visibility
 from cvtgs.config import Rates, RefineConfig
-from cvtgs.cvt import nearest_scipy
+from cvtgs.cvt import nearest_site
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation.scorer import MOST_PSNR, Scorer
 from cvtgs.losses import relative_loss
@@ -210,53 +210,54 @@ class SceneOptimizer:
         self._start = start | {"quats": parameters.normalize_quats(start["quats"])}
         self._units = _units(scene, learning_rate_scale)
         self._frames = parameters.rotation_matrices(self._start["quats"])
-        self._changes = {
-            name: torch.zeros_like(tensor, requires_grad=True)
-            for name, tensor in self._start.items()
-        }
         self._rates = {
             name: rate
             for name, rate in rates.model_dump().items()
             if rate > 0 and self._start[name].numel()
         }
+        # All changes are columns of one tensor, which takes far fewer operations.
+        self._widths = [self._start[name][0].numel() for name in self._rates]
+        self._changes = scene.means.new_zeros(len(scene), sum(self._widths), requires_grad=True)
         self._moved = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
-        self._moments = {
-            name: (torch.zeros_like(self._start[name]), torch.zeros_like(self._start[name]))
-            for name in self._rates
-        }
+        self._moments = torch.zeros_like(self._changes), torch.zeros_like(self._changes)
         self._steps = 0
 
     def scene(self) -> GaussianScene:
         """Return the scene, differentiable in the changes."""
-        shifts = {name: change * self._units[name] for name, change in self._changes.items()}
-        means = (self._frames @ shifts["means"][:, :, None])[:, :, 0]
-        turns = parameters.multiply_quats(self._start["quats"], shifts["quats"])
-        shifts |= {"means": means, "quats": turns}
-        tensors = {name: start + shifts[name] for name, start in self._start.items()}
-        return self._scene.with_tensors(tensors)
+        shifts = {
+            name: change.view(self._start[name].shape) * self._units[name]
+            for name, change in zip(self._rates, self._changes.split(self._widths, 1), strict=True)
+        }
+        if "means" in shifts:
+            shifts["means"] = (self._frames @ shifts["means"][:, :, None])[:, :, 0]
+        if "quats" in shifts:
+            shifts["quats"] = parameters.multiply_quats(self._start["quats"], shifts["quats"])
+        moved = {name: self._start[name] + shift for name, shift in shifts.items()}
+        return self._scene.with_tensors(self._start | moved)
 
     def step(self, loss: Tensor, *, factor: float) -> None:
         """Move every Gaussian with a finite nonzero gradient."""
         if not self._rates or not loss.requires_grad:
             return
-        changes = [self._changes[name] for name in self._rates]
-        gradients = torch.autograd.grad(loss, changes, materialize_grads=True)
-        rows = _rows_to_move(gradients)
+        (gradient,) = torch.autograd.grad(loss, [self._changes], materialize_grads=True)
+        rows = ((gradient != 0).any(dim=1) & gradient.isfinite().all(dim=1)).nonzero()[:, 0]
         self._steps += 1
         biases = [1 - beta**self._steps for beta in _BETAS]
-        for (name, rate), gradient in zip(self._rates.items(), gradients, strict=True):
-            length = factor * rate * math.sqrt(biases[1]) / biases[0]
-            largest = 0.5 * torch.finfo(gradient.dtype).max ** 0.5  # its square must not overflow
-            some = gradient.index_select(0, rows).clamp_(-largest, largest)
-            means, squares = (
-                _moved_average(values, rows, new, beta)
-                for values, new, beta in zip(
-                    self._moments[name], (some, some.square()), _BETAS, strict=True
-                )
-            )
-            change = -length * means.div_(squares.sqrt_().add_(_LEAST_ROOT))
-            values = self._changes[name].detach()
-            values.index_copy_(0, rows, change.add_(values.index_select(0, rows)))
+        scale = factor * math.sqrt(biases[1]) / biases[0]
+        lengths = [
+            scale * rate
+            for rate, width in zip(self._rates.values(), self._widths, strict=True)
+            for _ in range(width)
+        ]
+        largest = 0.5 * torch.finfo(gradient.dtype).max ** 0.5  # its square must not overflow
+        some = gradient.index_select(0, rows).clamp_(-largest, largest)
+        means, squares = (
+            _moved_average(values, rows, new, beta)
+            for values, new, beta in zip(self._moments, (some, some.square()), _BETAS, strict=True)
+        )
+        change = means.div_(squares.sqrt_().add_(_LEAST_ROOT)).mul_(-gradient.new_tensor(lengths))
+        values = self._changes.detach()
+        values.index_copy_(0, rows, change.add_(values.index_select(0, rows)))
         self._moved[rows] = True
 
     @torch.no_grad()
@@ -300,16 +301,6 @@ def _moved_average(values: Tensor, rows: Tensor, new: Tensor, beta: float) -> Te
     return moved
 
 
-def _rows_to_move(gradients: tuple[Tensor, ...]) -> Tensor:
-    some = torch.zeros(len(gradients[0]), dtype=torch.bool, device=gradients[0].device)
-    finite = ~some
-    for gradient in gradients:
-        flat = gradient.reshape(len(gradient), -1)
-        some |= (flat != 0).any(dim=1)
-        finite &= flat.isfinite().all(dim=1)
-    return (some & finite).nonzero()[:, 0]
-
-
 def _like(values: Float[Tensor, "n"], tensor: Tensor) -> Tensor:
     """Reshape values per Gaussian to broadcast against a tensor."""
     return values.reshape(-1, *[1] * (tensor.ndim - 1))
@@ -339,7 +330,7 @@ def _concentrations(small: GaussianScene, full: GaussianScene) -> Float[Tensor, 
     Simpson 1949, one over their effective number), at most :data:`MOST_CONCENTRATED`, or the own
     share of a Gaussian unchanged from the full scene, if that is larger.
     """
-    labels, _ = nearest_scipy(full.means, small.means)
+    labels, _ = nearest_site(full.means, small.means)
     same = torch.ones_like(labels, dtype=torch.bool)
     for name in ("means", "log_scales", "logit_opacities", "sh0"):
         before, now = getattr(full, name), getattr(small, name)

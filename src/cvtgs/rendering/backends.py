@@ -76,7 +76,7 @@ class Backend(Protocol):
         sh_degree: int,
         listener: ProgressListener,
     ) -> RasterOutput:
-        """Render images on black; scene and cameras must be on the same device."""
+        """Render images on black, on the device of the scene; cameras may be on any."""
         ...
 
     def contributions(self, scene: GaussianScene, camera: Cameras) -> Tensor:

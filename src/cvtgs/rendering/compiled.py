@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cvtgs.devices import kernel_threads
 from cvtgs.errors import MissingDependencyError, how_to_install, is_out_of_memory
 
 try:
@@ -95,12 +96,14 @@ def _compiled(function: F, **settings: Any) -> F:
 def threads_of_torch() -> Iterator[None]:
     """Make compiled functions called from this thread use as many threads as torch.
 
-    Where both share an OpenMP library, numba also changes the number for torch when it starts its
-    threads, so this restores it.
+    Images do not depend on the number, so they use more where torch is limited to one. Where both
+    share an OpenMP library, numba also changes the number for torch when it starts its threads, so
+    this restores it.
     """
-    count, most = torch.get_num_threads(), vars(numba.config)["NUMBA_NUM_THREADS"]
+    count, wanted = torch.get_num_threads(), kernel_threads()
+    most = vars(numba.config)["NUMBA_NUM_THREADS"]
     before = numba.get_num_threads()
-    numba.set_num_threads(max(1, min(count, most)))
+    numba.set_num_threads(max(1, min(wanted, most)))
     if torch.get_num_threads() != count:
         torch.set_num_threads(count)
     try:

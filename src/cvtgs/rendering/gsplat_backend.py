@@ -1,8 +1,8 @@
 """The fast backend on CUDA: gsplat (Ye et al. 2024); the only file that imports it.
 
-Written against the documentation of gsplat 1.5.3. The tests have no GPU: they run against a
-stand-in with the documented signature and arithmetic (tests/gsplat_stand_in.py). One rule differs
-from 3DGS: alpha is limited to 0.999 instead of 0.99.
+Written for gsplat 1.5.3. Without a GPU, the tests run against a stand-in with its signature and
+arithmetic (tests/gsplat_stand_in.py). One rule differs from 3DGS: alpha is limited to 0.999 instead
+of 0.99.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cvtgs.cameras import Cameras, view_scales
+from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError, MissingDependencyError, how_to_install
 from cvtgs.math.spherical_harmonics import REST_COUNTS, evaluate
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
@@ -24,7 +24,7 @@ from cvtgs.rendering.backends import (
     RasterOutput,
     contributions_by_gradient,
 )
-from cvtgs.rendering.projection import DILATION, NEAR_PLANE, to_pinholes
+from cvtgs.rendering.projection import DILATION, NEAR_PLANE, to_matrices
 from cvtgs.scene import GaussianScene
 
 PROBE_TOLERANCE = 0.02
@@ -64,7 +64,6 @@ def rasterize(
 
     Memory: that of gsplat, linear in cameras times Gaussians and in intersections.
     """
-    to_pinholes(cameras)  # validates the cameras
     listener(ProgressEvent(stage=STAGE, done=0, total=len(cameras)))
     if len(scene) and len(cameras):
         are_mixed = scene.antialiased and len(set(cameras.ignores_tag)) > 1
@@ -73,6 +72,7 @@ def rasterize(
         found = [_rasterize_all(scene, part, sh_degree) for part in parts]
         layers, alpha = (torch.cat(images) for images in zip(*found, strict=True))
     else:
+        to_matrices(cameras)  # checks them
         layers = scene.means.new_zeros(len(cameras), cameras.height, cameras.width, 4)
         alpha = layers[..., :1]
     listener(ProgressEvent(stage=STAGE, done=len(cameras), total=len(cameras)))
@@ -104,7 +104,7 @@ def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tu
         colors = torch.cat([scene.sh0, rest], dim=1)
     else:
         colors = evaluate(scene.sh0, rest, scene.means)
-    means, viewmats = _about_cameras(scene, cameras)
+    means, viewmats, intrinsics = _about_cameras(scene, cameras)
     is_compensated = scene.antialiased and not any(cameras.ignores_tag)
     layers, alpha, _ = _gsplat().rasterization(
         means=means.float(),
@@ -112,8 +112,8 @@ def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tu
         scales=scene.scales.float(),
         opacities=scene.opacities.float(),
         colors=colors.float(),
-        viewmats=viewmats.float(),
-        Ks=cameras.Ks.float(),
+        viewmats=viewmats,
+        Ks=intrinsics,
         width=cameras.width,
         height=cameras.height,
         near_plane=NEAR_PLANE,
@@ -126,17 +126,20 @@ def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tu
     return layers, alpha
 
 
-def _about_cameras(scene: GaussianScene, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Return means and view matrices relative to the mean camera position, in float64.
+def _about_cameras(scene: GaussianScene, cameras: Cameras) -> tuple[Tensor, Tensor, Tensor]:
+    """Return means and view matrices relative to the mean camera position, and intrinsics.
 
-    gsplat works in float32, which is too coarse for either far from the origin. View matrices are
-    without their uniform scales, so that depths are in scene units.
+    gsplat works in float32, which is too coarse for positions far from the origin. What concerns
+    cameras alone is computed on the host.
     """
-    viewmats = cameras.viewmats.double().clone()
-    viewmats[:, :3] /= view_scales(viewmats)[:, None, None]
-    middle = cameras.centers.double().mean(dim=0)
-    viewmats[:, :3, 3] += viewmats[:, :3, :3] @ middle
-    return scene.means.double() - middle, viewmats
+    viewmats, intrinsics = to_matrices(cameras)
+    rotations, count = viewmats[:, :3, :3], len(cameras)
+    middle = -(rotations.mT @ viewmats[:, :3, 3:]).mean(dim=0)[:, 0]
+    viewmats[:, :3, 3] += rotations @ middle
+    table = torch.cat([middle, viewmats.flatten(), intrinsics.flatten()]).to(scene.device)
+    middle, viewmats, intrinsics = table.split([3, 16 * count, 9 * count])
+    means = scene.means.double() - middle
+    return means, viewmats.float().view(-1, 4, 4), intrinsics.float().view(-1, 3, 3)
 
 
 def _gsplat() -> Any:

@@ -99,14 +99,23 @@ class CameraTensors(NamedTuple):
         return cls(rotation.view(3, 3), table[:3], table[9:12], *pairs)
 
 
-def to_pinholes(cameras: Cameras) -> list[Pinhole]:
-    """Check cameras and convert them to plain numbers."""
+def to_matrices(cameras: Cameras) -> tuple[Float[Tensor, "c 4 4"], Float[Tensor, "c 3 3"]]:
+    """Check cameras; return view matrices without scales, and intrinsics, float64 on the host.
+
+    Without their uniform scales, depths are in scene units.
+    """
     both = cameras.viewmats.flatten(1).double(), cameras.Ks.flatten(1).double()
     table = torch.cat(both, dim=1).detach().cpu()
     viewmats, Ks = table[:, :16].view(-1, 4, 4), table[:, 16:].view(-1, 3, 3)  # noqa: N806 (as gsplat)
     _check(viewmats, Ks)
     viewmats = viewmats.clone()
-    viewmats[:, :3] /= view_scales(viewmats)[:, None, None]  # depths are in scene units
+    viewmats[:, :3] /= view_scales(viewmats)[:, None, None]
+    return viewmats, Ks
+
+
+def to_pinholes(cameras: Cameras) -> list[Pinhole]:
+    """Check cameras and convert them to plain numbers."""
+    viewmats, Ks = to_matrices(cameras)  # noqa: N806 (as gsplat)
     centers = -torch.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[:, :, 0]
     modes = cameras.ignores_tag or (False,) * len(cameras)
     strides = cameras.strides or (1,) * len(cameras)

@@ -98,7 +98,7 @@ def render(
     degree = _degree(scene, sh_degree)
     behind = _background(scene, cameras, background)
     name, chosen = choose_backend(backend, scene.device)
-    output = chosen.rasterize(scene, cameras.to(scene.device), sh_degree=degree, listener=listener)
+    output = chosen.rasterize(scene, cameras, sh_degree=degree, listener=listener)
     if behind is None:
         rgb = output.rgb.contiguous()
     else:
@@ -144,7 +144,7 @@ def contributions(
     """
     chosen = choose_backend(backend, scene.device)[1]
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
-    for camera in checked_cameras(cameras).to(scene.device).singles():
+    for camera in checked_cameras(cameras).singles():
         total += chosen.contributions(scene, camera)
     return total
 
@@ -203,7 +203,7 @@ def observe(
     name, chosen = choose_backend(backend, scene.device)
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
     outputs = []
-    for camera in cameras.to(scene.device).singles():
+    for camera in cameras.singles():
         output, found = chosen.observe(scene, camera, sh_degree=scene.sh_degree)
         total += found
         outputs.append(output)
@@ -249,7 +249,7 @@ def blending_weights(
     if len(camera) != 1:
         raise InvalidArgumentError(f"camera must be a single camera, found {len(camera)}.")
     chosen = choose_backend(backend, scene.device)[1]
-    return chosen.blending_weights(scene, camera.to(scene.device))
+    return chosen.blending_weights(scene, camera)
 
 
 def _degree(scene: GaussianScene, sh_degree: int | None) -> int:

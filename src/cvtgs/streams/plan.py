@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.boxes import Corner
-from cvtgs.cvt import nearest_scipy
+from cvtgs.cvt import nearest_site
 from cvtgs.devices import on_host
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.arrays import morton_rows
@@ -233,7 +233,7 @@ def _parents(level: StreamedLevel, coarsest: StreamedLevel) -> Int[Tensor, "m"]:
     missing = (parents < 0).nonzero()[:, 0]  # the coarsest level left out all of their rows
     if len(missing):
         means, sites = level.scene.means.cpu(), coarsest.scene.means.cpu()
-        parents[missing], _ = nearest_scipy(means[missing], sites)
+        parents[missing], _ = nearest_site(means[missing], sites)
     return parents
 
 

@@ -1,0 +1,103 @@
+"""A balanced k-d tree of sites in torch operations: leaves, boxes, and the leaf of a point."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+FAN_BITS = 3
+"""Levels of the tree that are descended at once: a box has eight children."""
+
+FARTHEST = 1e37
+"""Limit of coordinates in float32, in units."""
+
+
+class Boxes(NamedTuple):
+    """Boxes with axes along the coordinates.
+
+    Attributes:
+        low: ``(k, d)`` smallest coordinates.
+        high: ``(k, d)`` largest coordinates.
+    """
+
+    low: Float[Tensor, "k d"]
+    high: Float[Tensor, "k d"]
+
+    @classmethod
+    def around(cls, points: Float[Tensor, "k p d"]) -> "Boxes":
+        """Return the boxes around groups of points."""
+        return cls(points.amin(dim=1), points.amax(dim=1))
+
+    def enlarged(self, unit: Float[Tensor, ""]) -> "Boxes":
+        """Return boxes in float32 and in units, rounded outwards."""
+        low, high = ((corners / unit).clamp(-FARTHEST, FARTHEST) for corners in self)
+        inner = low.float(), high.float()
+        infinity = torch.full_like(inner[0], torch.inf)
+        return Boxes(
+            torch.where(inner[0] > low, inner[0].nextafter(-infinity), inner[0]),
+            torch.where(inner[1] < high, inner[1].nextafter(infinity), inner[1]),
+        )
+
+
+class Leaves(NamedTuple):
+    """Sites in the leaves of a balanced k-d tree, all of equal size.
+
+    Attributes:
+        sites: ``(b, s, d)`` positions; to fill the leaves, some sites occur twice.
+        rows: ``(b, s)`` their rows.
+        is_filling: ``(b, s)`` whether a site occurs in another place as well.
+        splits: Axis and position of the split of every box, level by level from the root.
+    """
+
+    sites: Float[Tensor, "b s d"]
+    rows: Int[Tensor, "b s"]
+    is_filling: Bool[Tensor, "b s"]
+    splits: list[tuple[Int[Tensor, "k"], Float[Tensor, "k"]]]
+
+
+def split_sites(sites: Float[Tensor, "m d"], most: int) -> Leaves:
+    """Split sites at the medians of the longest axes into leaves of at most ``most`` sites."""
+    count, device = len(sites), sites.device
+    height = max(0, math.ceil(math.log2(count / most)))
+    size = math.ceil(count / 2**height)
+    filling = size * 2**height - count
+    rows = torch.arange(count, device=device)
+    rows = torch.cat([rows, torch.arange(filling, device=device) * count // max(1, filling)])
+    places, positions, splits = torch.arange(len(rows), device=device), sites[rows], []
+    for level in range(height):
+        parts = positions.view(2**level, -1, sites.shape[1])
+        axis = (parts.amax(dim=1) - parts.amin(dim=1)).argmax(dim=1)
+        keys = parts.gather(2, axis[:, None, None].expand(-1, parts.shape[1], 1))[:, :, 0]
+        keys, ranks = torch.sort(keys, dim=1, stable=True)
+        half = keys.shape[1] // 2
+        splits.append((axis, 0.5 * keys[:, half - 1] + 0.5 * keys[:, half]))
+        ranks += torch.arange(2**level, device=device)[:, None] * keys.shape[1]
+        places, positions = places[ranks.flatten()], positions[ranks.flatten()]
+    return Leaves(
+        sites=positions.view(2**height, size, -1),
+        rows=rows[places].view(-1, size),
+        is_filling=(places >= count).view(-1, size),
+        splits=splits,
+    )
+
+
+def home_leaves(
+    points: Float[Tensor, "n d"], splits: list[tuple[Int[Tensor, "k"], Float[Tensor, "k"]]]
+) -> Int[Tensor, "n"]:
+    """Return the leaf that each point lies in."""
+    boxes = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+    for axis, place in splits:
+        values = points.gather(1, axis[boxes][:, None])[:, 0]
+        boxes = 2 * boxes + (values > place[boxes])
+    return boxes
+
+
+def boxes_of(sites: Float[Tensor, "b s d"]) -> list[Boxes]:
+    """Return the boxes of the tree, level by level from few large ones to the leaves."""
+    levels = [Boxes.around(sites)]
+    while len(levels[0].low) > 1 << FAN_BITS:
+        low, high = (corners.unflatten(0, (-1, 1 << FAN_BITS)) for corners in levels[0])
+        levels.insert(0, Boxes(low.amin(dim=1), high.amax(dim=1)))
+    return levels

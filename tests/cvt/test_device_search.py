@@ -1,0 +1,134 @@
+"""The search on a device: the nearest sites of brute force, whatever the scales and duplicates."""
+
+import pytest
+import torch
+
+from cvtgs.cvt import device_search
+from cvtgs.cvt.device_search import nearest_in_tiles
+from cvtgs.cvt.leaves import Boxes, boxes_of, home_leaves, split_sites
+from pretended_device import pretended_cuda
+
+
+def cloud(count, axes, seed=0):
+    generator = torch.Generator().manual_seed(100 * count + seed)
+    return torch.randn(count, axes, generator=generator, dtype=torch.float64)
+
+
+def smallest(points, sites, count):
+    """Return the smallest distances of every point."""
+    distances = (points.double()[:, None] - sites.double()).norm(dim=2)
+    return distances.sort(dim=1).values[:, :count]
+
+
+def assert_found(points, sites, count):
+    rows, squared = nearest_in_tiles(points, sites, count)
+    assert rows.shape == squared.shape == (len(points), count)
+    wanted = smallest(points, sites, count)
+    torch.testing.assert_close(squared.sqrt(), wanted, rtol=1e-9, atol=0)
+    own = (points.double()[:, None] - sites.double()[rows]).norm(dim=2)
+    torch.testing.assert_close(own, wanted, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("axes", [1, 3, 6])
+@pytest.mark.parametrize("count", [1, 4, 9])
+@pytest.mark.parametrize("sites", [9, 17, 100, 1000])
+def test_the_nearest_are_found(sites, count, axes):
+    places = cloud(sites, axes)
+    points = torch.cat([2 * cloud(300, axes, seed=1), places[:50]])  # some outside, some on sites
+    assert_found(points, places, count)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-6, 1.0, 1e6, 1e30])
+def test_scenes_of_any_scale(scale):
+    assert_found(scale * cloud(500, 3), scale * cloud(200, 3, seed=1), 4)
+
+
+@pytest.mark.parametrize("count", [1, 9])
+@pytest.mark.parametrize("far", [1e3, 1e12, 1e30])
+def test_a_few_sites_and_points_far_away(far, count):
+    sites = torch.cat([cloud(2000, 3), far * cloud(3, 3, seed=1)])
+    assert_found(sites.float(), sites.float(), count)
+
+
+def test_distances_over_many_decades():
+    points, sites = (cloud(n, 3) * 10 ** (6 * torch.rand(n, 1).double()) for n in (2000, 300))
+    assert_found(points, sites, 1)
+
+
+def test_coincident_sites_are_not_compared_with_all_points(monkeypatch):
+    """A tile has one list of leaves; of coincident ones, only those of its own points."""
+    listed = []
+    search = device_search._candidates
+
+    def counted(*arguments):
+        found = search(*arguments)
+        listed.append(len(found.leaves))
+        return found
+
+    monkeypatch.setattr(device_search, "_candidates", counted)
+    sites = torch.zeros(5000, 3)
+    rows, squared = nearest_in_tiles(sites, sites, 9)
+    assert not squared.any()
+    assert all(len(set(row)) == 9 for row in rows.tolist())
+    assert listed[0] < 1000  # of 157 tiles times 256 leaves
+
+
+def test_no_points():
+    rows, squared = nearest_in_tiles(torch.zeros(0, 3), torch.zeros(5, 3), 2)
+    assert (rows.shape, squared.shape) == ((0, 2), (0, 2))
+
+
+def test_chunks_give_the_same(monkeypatch):
+    points, sites = cloud(3000, 6), cloud(700, 6, seed=1)
+    wanted = nearest_in_tiles(points, sites, 4)
+    monkeypatch.setattr(device_search, "TILES", 3)
+    monkeypatch.setattr(device_search, "DISTANCES", 1000)
+    for found, same in zip(nearest_in_tiles(points, sites, 4), wanted, strict=True):
+        assert torch.equal(found, same)
+
+
+def test_fewer_bits_of_matrix_products_are_not_used():
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    try:
+        with device_search._full_float32():
+            assert torch.get_float32_matmul_precision() == "highest"
+        assert torch.get_float32_matmul_precision() == "medium"
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def test_a_search_on_the_device_stays_there():
+    points, sites = cloud(400, 6), cloud(100, 6, seed=1)
+    with pretended_cuda() as traffic:
+        there = points.to("cuda"), sites.to("cuda")
+        traffic.copies.clear()
+        _, squared = nearest_in_tiles(*there, 3)
+        assert not traffic.copies
+        assert traffic.waits.total() <= 12, traffic.waits
+        torch.testing.assert_close(squared.cpu().sqrt(), smallest(points, sites, 3))
+
+
+@pytest.mark.parametrize("count", [1, 16, 17, 100, 1000])
+def test_leaves_hold_every_site_and_its_home(count):
+    sites = cloud(count, 3)
+    leaves = split_sites(sites, 16)
+    assert leaves.rows.shape[1] <= 16
+    assert leaves.rows[~leaves.is_filling].sort().values.tolist() == list(range(count))
+    assert torch.equal(leaves.sites, sites[leaves.rows])
+    homes = home_leaves(sites, leaves.splits)
+    assert (leaves.rows[homes] == torch.arange(count)[:, None]).any(dim=1).all()
+    first, last = boxes_of(leaves.sites)[0], boxes_of(leaves.sites)[-1]
+    assert len(first.low) <= 8
+    assert len(last.low) == len(leaves.rows)
+    assert torch.equal(first.low.amin(0), sites.amin(0))
+    assert torch.equal(last.high.amax(0), sites.amax(0))
+
+
+def test_boxes_are_rounded_outwards():
+    sites = 1e-3 * cloud(4000, 3)
+    boxes = Boxes.around(sites.view(-1, 1, 3))
+    found = boxes.enlarged(torch.tensor(0.1).double())
+    assert found.low.dtype == torch.float32
+    assert (found.low.double() <= boxes.low / torch.tensor(0.1)).all()
+    assert (found.high.double() >= boxes.high / torch.tensor(0.1)).all()
