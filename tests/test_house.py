@@ -15,12 +15,13 @@ FILES = sorted(SOURCE.rglob("*.py"))
 TEXTS = {path: path.read_text(encoding="utf-8") for path in FILES}
 
 # A file imports only from lower levels, or from inside its own package: the ranks of the design,
-# split where one module of a rank needs another. `math` raises the errors of `errors` and `report`
-# shows the effect plan of `analysis`, so each stands above the module it needs; `devices` (names of
-# devices) and `cameras` (data) stand as low as their imports allow.
+# split where one module of a rank needs another. `math` raises the errors of `errors` and takes the
+# chunks of `devices`, and `report` shows the effect plan of `analysis`, so each stands above the
+# modules it needs; `devices` and `cameras` (data) stand as low as their imports allow.
 LEVELS = [
     {"errors", "progress", "startup", "text"},
-    {"math", "clock", "devices", "plots", "counts", "boxes", "selection"},
+    {"devices"},
+    {"math", "clock", "plots", "counts", "boxes", "selection"},
     {"config", "scene", "cameras", "processes"},
     {"validity", "edit"},
     {"io", "synthetic", "rendering", "losses"},

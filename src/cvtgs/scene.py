@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.counts import whole_number
-from cvtgs.devices import usable_device
+from cvtgs.devices import chunk_length, usable_device
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.selection import row_numbers
@@ -136,9 +136,9 @@ class GaussianScene:
     def areas(self) -> Float[Tensor, "n"]:
         """Mean projected areas of the one-sigma ellipsoids, squared scene units, float64."""
         areas = self.log_scales.new_empty(len(self.means), dtype=torch.float64)
-        for start in range(0, len(areas), _CHUNK):
-            part = self.log_scales[start : start + _CHUNK].double()
-            areas[start : start + _CHUNK] = parameters.mean_projected_area(torch.exp(part))
+        length = chunk_length(_CHUNK, self.device)
+        for part, found in zip(self.log_scales.split(length), areas.split(length), strict=True):
+            found[:] = parameters.mean_projected_area(torch.exp(part.double()))
         return areas
 
     @property

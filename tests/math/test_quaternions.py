@@ -79,7 +79,7 @@ def test_normalize_survives_tiny_and_huge(dtype, power):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_denormal_quaternions_that_do_not_matter_have_no_gradient(dtype):
     quats = torch.full((3, 4), torch.finfo(dtype).tiny / 100, dtype=dtype, requires_grad=True)
-    (0.0 * rotation_matrices(quats)).sum().backward()
+    (0.0 * parameters.rotation_matrices(quats)).sum().backward()
     assert not quats.grad.any()
 
 

@@ -29,9 +29,9 @@ TILES = 1 << 12
 DISTANCES = 1 << 22
 """Distances per matrix product, at the chunk length of a CPU."""
 
-CLOSE = 1e-4
+CLOSE = 1e-5
 """Squared distances below this share of the squared reach of a tile are too close for float32,
-which is off by at most 1e-6 of it; they are computed again in float64."""
+which is off by at most some 3e-7 of it; they are computed again in float64."""
 
 EXACT_COST = 8
 """Memory of an exact distance, in units of that of a fast one, rounded up."""
@@ -83,8 +83,8 @@ def nearest_in_tiles(
     """Find the nearest sites of every point, on the device of both.
 
     Sites are chosen by distances in float32, relative to the middle of the tile, and by distances
-    in float64 where those are too coarse. Where two sites are equally near but for some permille,
-    either may be found.
+    in float64 where those are too coarse. Where two sites are equally near but for a percent or
+    less, either may be found.
 
     Args:
         points: Positions.

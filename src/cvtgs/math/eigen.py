@@ -7,8 +7,8 @@ from torch import Tensor
 Pair = tuple[Tensor, Tensor]
 Three = tuple[Tensor, Tensor, Tensor]
 
-SWEEPS = 6
-"""Rotations of all three planes. In float64, four leave at most rounding; two more are spare."""
+SWEEPS = 5
+"""Rotations of all three planes. In float64, four leave only rounding errors; one is spare."""
 
 
 def symmetric_eigen(

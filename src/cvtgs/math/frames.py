@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.devices import chunk_length
+
 RADIUS_QUANTILE = 0.7
 """The share of points within the radius of a frame."""
 
@@ -58,9 +60,10 @@ class RobustFrame:
             Distances in float64.
         """
         found = torch.empty(len(points), dtype=torch.float64, device=points.device)
-        for start in range(0, len(points), CHUNK):
-            local = self.normalize(points[start : start + CHUNK])
-            found[start : start + CHUNK] = torch.linalg.vector_norm(local, dim=1)
+        length = chunk_length(CHUNK, points.device)
+        for start in range(0, len(points), length):
+            local = self.normalize(points[start : start + length])
+            found[start : start + length] = torch.linalg.vector_norm(local, dim=1)
         return found
 
     def contract(self, points: Float[Tensor, "n 3"], strength: float = 1.0) -> Float[Tensor, "n 3"]:
