@@ -1,6 +1,6 @@
 """Apply MergeNet: correct the cells of a scene by the residuals that the network predicts."""
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 
 import torch
@@ -127,34 +127,33 @@ def _correct_gated(  # noqa: PLR0913 (options by name)
     """Yield runs of cells and their corrected tensors."""
     chunk, near = chunk_length(CHUNK_MEMBERS, scene.device), neighbors.shape[1]
     step = max(1, chunk // max(1, near))
-    for block in (slice(start, start + step) for start in range(0, len(cells), step)):
-        context = neighbor_context(
-            merged, cells=cells[block], neighbors=neighbors[cells[block]], sizes=sizes
+
+    def chunks() -> Iterator[tuple[Tensor, NeighborContext, Partition]]:
+        for block in (slice(start, start + step) for start in range(0, len(cells), step)):
+            own = cells[block]
+            context = neighbor_context(merged, cells=own, neighbors=neighbors[own], sizes=sizes)
+            for run, part in several.cut(block).chunks(chunk, cell_cost=near):
+                yield own[run], context.cut(run), part
+
+    def correct(
+        item: tuple[Tensor, NeighborContext, Partition],
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        rows, context, part = item
+        descriptors = describe_members(
+            scene, part, context=context, visibility=visibility, pixel_size=pixel_size
         )
+        residuals = net(descriptors)
+        corrected = compose(
+            scene,
+            merged,
+            descriptors.part,
+            cells=rows,
+            neighbors=neighbors[rows],
+            residuals=residuals,
+        )
+        return rows, corrected
 
-        def correct(
-            item: tuple[slice, Partition],
-            block: slice = block,
-            context: NeighborContext = context,
-        ) -> tuple[Tensor, dict[str, Tensor]]:
-            run, part = item
-            rows = cells[block][run]
-            descriptors = describe_members(
-                scene,
-                part,
-                context=context.cut(run),
-                visibility=visibility,
-                pixel_size=pixel_size,
-            )
-            residuals = net(descriptors)
-            near = neighbors[rows]
-            corrected = compose(
-                scene, merged, descriptors.part, cells=rows, neighbors=near, residuals=residuals
-            )
-            return rows, corrected
-
-        chunks = several.cut(block).chunks(chunk, cell_cost=near)
-        yield from in_threads(correct, chunks, scene.device)
+    yield from in_threads(correct, chunks(), scene.device)
 
 
 def _correct_as_published(
