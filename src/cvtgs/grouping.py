@@ -299,8 +299,8 @@ def add_neighbors(ordered: OrderedRows, target: int, config: AllocationConfig) -
         config: Number of neighbours.
 
     Returns:
-        The same with neighbours, 48 bytes per Gaussian, where pairs merge; unchanged if
-        it has them or needs none.
+        The same with neighbours, 48 bytes per Gaussian, where pairs merge; unchanged if it has them
+        or needs none.
     """
     points, total = ordered.points, len(ordered.filtered)
     from_singles = target < total and finer_count(target, total, config) == total

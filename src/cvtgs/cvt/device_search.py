@@ -110,10 +110,8 @@ def nearest_in_tiles(
     step = chunk_length(TILES, points.device) * TILE
     with _full_float32():
         for start in range(0, len(points), step):
-            rows = order[start : start + step]
-            part = points[rows]
-            near = _nearest_of_part(part, homes[start : start + step], leaves, boxes, count)
-            found[rows], squared[rows] = near, _squared(part, sites, near)
+            rows, own = order[start : start + step], homes[start : start + step]
+            found[rows], squared[rows] = _nearest_of_part(points[rows], own, leaves, boxes, count)
     if count > 1:
         squared, ranks = torch.sort(squared, dim=1, stable=True)
         found = found.gather(1, ranks)
@@ -126,17 +124,19 @@ def _nearest_of_part(
     leaves: Leaves,
     boxes: Sequence[Boxes],
     count: int,
-) -> Int[Tensor, "n k"]:
-    """Search for points that are sorted by the leaves they lie in."""
+) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
+    """Search for points that are sorted by the leaves they lie in; nearest sites in any order."""
     tiles = tiles_of(points, homes, leaves, count, size=TILE)
     near = _nearest_of_tiles(tiles, leaves, boxes, count, is_exact=False)[: len(points)]
     limits = (CLOSE * tiles.reach.square()).repeat_interleave(TILE)[: len(points), None]
-    squared = _squared(points, leaves.sites.flatten(0, 1), near)
+    sites = leaves.sites.flatten(0, 1)
+    squared = _squared(points, sites, near)
     unsure = ((squared > 0) & (squared < limits)).any(dim=1).nonzero()[:, 0]
     if len(unsure):
         singles = tiles_of(points[unsure], homes[unsure], leaves, count, size=1)
         near[unsure] = _nearest_of_tiles(singles, leaves, boxes, count, is_exact=True)
-    return leaves.rows.flatten()[near]
+        squared[unsure] = _squared(points[unsure], sites, near[unsure])
+    return leaves.rows.flatten()[near], squared
 
 
 def _squared(
