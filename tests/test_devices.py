@@ -200,17 +200,6 @@ def test_ranges_of_rows_cover_all_rows_once_and_an_empty_table_is_one_range():
     assert there == [256, 300]
 
 
-def test_ranges_of_rows_are_longer_for_several_threads(two_threads):
-    def lengths(total):
-        return in_chunks(lambda part: part.stop - part.start, total, 100, HOST)
-
-    assert lengths(1000) == [200] * 5
-    assert lengths(500) == [125] * 4  # two for each thread
-    assert lengths(300) == [100] * 3
-    with one_thread():
-        assert lengths(1000) == [100] * 10
-
-
 @pytest.mark.slow
 def test_stages_give_the_same_bits_in_two_threads(two_threads, monkeypatch):
     for name in ("allocate.CHUNK", "moments.CHUNK", "inflate.CHUNK", "merge.CHUNK_MEMBERS"):

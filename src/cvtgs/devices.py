@@ -176,10 +176,10 @@ def in_threads(
     the same bits, whatever the number of threads. On other devices than CPUs, chunks run
     sequentially. Results come in the order of the items, computed when requested or earlier.
     """
-    threads = _pool_size()
-    if device.type != "cpu" or threads == 1:
+    threads = _threads_of_torch()
+    if device.type != "cpu" or threads == 1 or thread_count() == 1:
         return map(function, items)
-    return _in_pool(function, items, threads)
+    return _in_pool(function, items, min(threads, thread_count()))
 
 
 def in_chunks(
@@ -187,22 +187,12 @@ def in_chunks(
 ) -> list[Result]:
     """Call a function for consecutive ranges of rows, as :func:`in_threads` does.
 
-    ``length`` is that on one thread of a CPU; with more threads, chunks are longer, since between
-    short operations threads would mostly wait for Python's lock. Without rows, there is one empty
-    range.
+    ``length`` is that on a CPU. Without rows, there is one empty range.
     """
     step = chunk_length(length, device)
-    if device.type == "cpu":
-        threads = _pool_size()
-        step = max(step, min(threads * step, -(-total // (2 * threads))))
     starts = range(0, max(1, total), step)
     parts = [slice(start, min(start + step, total)) for start in starts]
     return list(in_threads(function, parts, device))
-
-
-def _pool_size() -> int:
-    """Return the number of threads to compute chunks with."""
-    return min(_threads_of_torch(), thread_count())
 
 
 def _in_pool(
