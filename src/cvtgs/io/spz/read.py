@@ -2,7 +2,7 @@
 
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,9 +47,9 @@ _MOST_EXPANSION = 1032
 _TABLE_START = slice(16, 20)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class SpzHeader:
-    """The header of an ``.spz`` file of version 1 to 4."""
+    """The header of an ``.spz`` file of version 1 to 4, in the order of the file."""
 
     version: int
     count: int
@@ -81,15 +81,7 @@ class SpzHeader:
 
     def packed(self) -> bytes:
         """Return the first 16 bytes of the file."""
-        return HEADER.pack(
-            MAGIC,
-            self.version,
-            self.count,
-            self.sh_degree,
-            self.fractional_bits,
-            self.flags,
-            self.streams,
-        )
+        return HEADER.pack(MAGIC, *astuple(self))
 
 
 class _Content(NamedTuple):
@@ -282,29 +274,24 @@ def _header(start: bytes, path: Path | str, *, versions: tuple[int, ...]) -> Spz
             f"{path}: an .spz file must start with a header of {HEADER.size} bytes, "
             f"found {len(start)}."
         )
-    magic, version, count, degree, bits, flags, streams = HEADER.unpack(start)
+    magic, *fields = HEADER.unpack(start)
+    header = SpzHeader(*fields)
     if magic != MAGIC:
         raise FileFormatError(
             f"{path}: the header of an .spz file must start with b'NGSP', found {start[:4]!r}."
         )
-    if version not in versions:
+    if header.version not in versions:
         raise FileFormatError(
             f"{path}: the version of the .spz file must be 1 to 3, or 4 without gzip, "
-            f"found {version}."
+            f"found {header.version}."
         )
+    count, degree, bits = header.count, header.sh_degree, header.fractional_bits
     if count == 0 or degree >= len(STORED_REST_COUNTS) or bits > _MOST_BITS:
         raise FileFormatError(
             f"{path}: an .spz file must hold at least one Gaussian of SH degree 0 to 4 with at "
             f"most {_MOST_BITS} fractional bits, found {count:,} of degree {degree} with {bits}."
         )
-    return SpzHeader(
-        version=version,
-        count=count,
-        sh_degree=degree,
-        fractional_bits=bits,
-        flags=flags,
-        streams=streams,
-    )
+    return header
 
 
 def _too_short(path: Path | str, header: SpzHeader, wanted: int, found: str) -> FileFormatError:
