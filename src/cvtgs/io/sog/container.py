@@ -65,20 +65,17 @@ def _beside(path: Path) -> Iterator[tuple[Reader, StoredBytes]]:
 @contextmanager
 def _inside(path: Path) -> Iterator[tuple[Reader, StoredBytes]]:
     with open_input(path) as file:
-        try:
+        no_zip = f"{path}: a .sog file must be a zip of meta.json and images, found no zip"
+        with _damage_named(no_zip):
             archive = zipfile.ZipFile(file)
-        except Exception as error:  # zipfile passes on errors of its parts
-            if is_out_of_memory(error):
-                raise
-            raise FileFormatError(
-                f"{path}: a .sog file must be a zip of meta.json and images, found no zip: "
-                f"{_reason(error)}."
-            ) from error
 
         def read(name: str, most: int) -> bytes:
             _check_name(name, path)
-            try:
-                entry = archive.getinfo(name)
+            with _damage_named(f"{path}: {name} must be intact, found damage"):
+                try:
+                    entry = archive.getinfo(name)
+                except KeyError as error:
+                    raise FileFormatError(f"{path}: must contain {name}, found none.") from error
                 if entry.compress_type not in _METHODS:
                     raise FileFormatError(
                         f"{path}: {name} must be stored or deflated in the zip, found method "
@@ -86,25 +83,25 @@ def _inside(path: Path) -> Iterator[tuple[Reader, StoredBytes]]:
                     )
                 if entry.file_size > most:
                     raise _too_long(f"{path}: {name}", most, entry.file_size)
-                with archive.open(name) as member:
+                with archive.open(entry) as member:
                     return member.read(most)
-            except KeyError as error:
-                raise FileFormatError(f"{path}: must contain {name}, found none.") from error
-            except FileFormatError:
-                raise
-            except Exception as error:
-                if is_out_of_memory(error):
-                    raise
-                raise FileFormatError(
-                    f"{path}: {name} must be intact, found damage: {_reason(error)}."
-                ) from error
 
         with archive:
             yield read, lambda names: os.fstat(file.fileno()).st_size
 
 
-def _reason(error: Exception) -> str:
-    return shown(str(error).lower().rstrip(".") or type(error).__name__)[1:-1]
+@contextmanager
+def _damage_named(text: str) -> Iterator[None]:
+    """Convert any error of zipfile or Pillow, which pass on those of their parts and codecs."""
+    try:
+        yield
+    except FileFormatError:
+        raise
+    except Exception as error:
+        if is_out_of_memory(error):
+            raise
+        reason = shown(str(error).lower().rstrip(".") or type(error).__name__)[1:-1]
+        raise FileFormatError(f"{text}: {reason}.") from error
 
 
 def _check_name(name: str, path: Path) -> None:
@@ -127,26 +124,19 @@ def decode_webp(content: bytes, where: str, *, most_pixels: int) -> UInt8[np.nda
     """Decode an image that stores numbers in its channels."""
     from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 (loads in its time)
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(content), formats=("WEBP", "PNG")) as image:
-                if image.width * image.height > most_pixels:
-                    raise FileFormatError(
-                        f"{where} must have at most {most_pixels:,} pixels, "
-                        f"found {image.width} x {image.height}."
-                    )
-                return np.asarray(image.convert("RGBA"))
-    except UnidentifiedImageError as error:
-        raise FileFormatError(f"{where} must be a WebP image, found something else.") from error
-    except FileFormatError:
-        raise
-    except Exception as error:  # Pillow passes on errors of its codecs
-        if is_out_of_memory(error):
-            raise
-        raise FileFormatError(
-            f"{where} must be an intact image, found: {_reason(error)}."
-        ) from error
+    with _damage_named(f"{where} must be an intact image, found"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        try:
+            image = Image.open(io.BytesIO(content), formats=("WEBP", "PNG"))
+        except UnidentifiedImageError as error:
+            raise FileFormatError(f"{where} must be a WebP image, found something else.") from error
+        with image:
+            if image.width * image.height > most_pixels:
+                raise FileFormatError(
+                    f"{where} must have at most {most_pixels:,} pixels, "
+                    f"found {image.width} x {image.height}."
+                )
+            return np.asarray(image.convert("RGBA"))
 
 
 def encode_webp(numbers: UInt8[np.ndarray, "h w 4"]) -> bytes:
