@@ -65,35 +65,24 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
     target = _target(path)
     fault = windows_fault(PureWindowsPath(path)) if _WINDOWS else None
     if fault is not None:
-        raise OutputError(f"{os.fspath(path)}: the output must have a valid name, found {fault}.")
+        raise _refusal(path, "have a valid name", fault)
     try:
         if target.is_symlink():  # realpath follows all links but loops
-            raise OutputError(
-                f"{os.fspath(path)}: the output must be a file, found a loop of symbolic links."
-            )
+            raise _refusal(path, "be a file", "a loop of symbolic links")
         if target.is_dir():
-            raise OutputError(f"{os.fspath(path)}: the output must be a file, found a directory.")
+            raise _refusal(path, "be a file", "a directory")
         if (target.exists() and not target.is_file()) or _is_device(path):
-            raise OutputError(
-                f"{os.fspath(path)}: the output must be a regular file, found a device or a pipe."
-            )
+            raise _refusal(path, "be a regular file", "a device or a pipe")
         if target.exists() and not overwrite:
             raise _exists(path)
         if _WINDOWS and target.exists() and not os.access(target, os.W_OK):
-            raise OutputError(
-                f"{os.fspath(path)}: the output must be writable, found a read-only file."
-            )
+            raise _refusal(path, "be writable", "a read-only file")
         for folder in (target.parent, Path(path).parent):  # "missing/.." is not resolved by name
             if not folder.is_dir():
-                raise OutputError(
-                    f"{os.fspath(path)}: the output must be in an existing directory, "
-                    f"found no directory {os.fspath(folder)}."
-                )
+                raise _refusal(path, "be in an existing directory", f"no directory {folder}")
         if not os.access(target.parent, os.W_OK | os.X_OK):
-            raise OutputError(
-                f"{os.fspath(path)}: the output must be in a writable directory, "
-                f"found no permission to write in {os.fspath(target.parent)}."
-            )
+            missing = f"no permission to write in {target.parent}"
+            raise _refusal(path, "be in a writable directory", missing)
     except OSError as error:
         if isinstance(error, CvtgsError):
             raise
@@ -324,6 +313,10 @@ def _exists(path: str | os.PathLike[str]) -> OutputExistsError:
         f"{os.fspath(path)}: the output must not exist yet, found a file; pass overwrite=True "
         f"(--overwrite) to replace it."
     )
+
+
+def _refusal(path: str | os.PathLike[str], required: str, found: str) -> OutputError:
+    return OutputError(f"{os.fspath(path)}: the output must {required}, found {found}.")
 
 
 def _is_device(path: str | os.PathLike[str]) -> bool:
