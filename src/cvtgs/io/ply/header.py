@@ -85,11 +85,6 @@ class Property:
     count_type: str | None = None
     """Number type of the length of a list; None for a plain number."""
 
-    @property
-    def least_bytes(self) -> int:
-        """Bytes in a binary row; for a list, those of an empty one."""
-        return np.dtype(SCALARS[self.count_type or self.type].code).itemsize
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Element:
@@ -110,10 +105,11 @@ class Element:
         return tuple((prop.name, prop.type) for prop in self.properties if not prop.count_type)
 
     def row_bytes(self, encoding: Encoding) -> int:
-        """Return the minimum size of a row in bytes."""
+        """Return the minimum size of a row in bytes, with empty lists."""
         if encoding == "ascii":
             return 2 * len(self.properties)
-        return sum(prop.least_bytes for prop in self.properties)
+        kinds = [prop.count_type or prop.type for prop in self.properties]
+        return sum(np.dtype(SCALARS[kind].code).itemsize for kind in kinds)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

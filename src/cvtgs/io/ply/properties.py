@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 
@@ -17,33 +17,27 @@ _OPTIONAL = ("scale_2",)
 _REST_NAME = re.compile(r"f_rest_(0|[1-9][0-9]*)")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Slot:
+class Slot(NamedTuple):
     """The place of the column of a property in a scene."""
 
     tensor: str
-    index: tuple[int, ...]
-    """Index into that tensor after the row, for example ``(0,)``."""
-
-    @property
-    def rows(self) -> tuple[slice | int, ...]:
-        """The index of the whole column."""
-        return (slice(None), *self.index)
+    column: tuple[Any, ...]
+    """Index into that tensor, for example ``(..., 0)``."""
 
 
 def standard_slots(rest_count: int) -> dict[str, Slot]:
     """Return the standard properties in INRIA's order with their slots."""
     return {
-        **{name: Slot(tensor="means", index=(i,)) for i, name in enumerate("xyz")},
-        **{f"f_dc_{c}": Slot(tensor="sh0", index=(0, c)) for c in range(3)},
+        **{name: Slot("means", (..., i)) for i, name in enumerate("xyz")},
+        **{f"f_dc_{c}": Slot("sh0", (..., 0, c)) for c in range(3)},
         **{
-            f"f_rest_{c * rest_count + j}": Slot(tensor="shN", index=(j, c))
+            f"f_rest_{c * rest_count + j}": Slot("shN", (..., j, c))
             for c in range(3)
             for j in range(rest_count)
         },
-        "opacity": Slot(tensor="logit_opacities", index=()),
-        **{f"scale_{i}": Slot(tensor="log_scales", index=(i,)) for i in range(3)},
-        **{f"rot_{i}": Slot(tensor="quats", index=(i,)) for i in range(4)},
+        "opacity": Slot("logit_opacities", (...,)),
+        **{f"scale_{i}": Slot("log_scales", (..., i)) for i in range(3)},
+        **{f"rot_{i}": Slot("quats", (..., i)) for i in range(4)},
     }
 
 

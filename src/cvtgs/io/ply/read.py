@@ -47,20 +47,8 @@ def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -
     """Read a scene from a PLY file of any encoding, property order and number type.
 
     The common layout (binary little endian, vertices first) is memory-mapped; plyfile reads the
-    others. Both give the same scene.
-
-    Args:
-        path: The file.
-        sh_degree: SH bands above this degree are not copied but set to zero; None keeps all.
-        extras: Whether columns beyond the standard ones are copied.
-
-    Returns:
-        The scene, on the CPU. Values are returned as they are, including NaN and infinity.
-
-    Raises:
-        InputNotFoundError: The file does not exist.
-        InputError: It cannot be opened or read.
-        FileFormatError: It is not a PLY file of a 3DGS scene, or damaged.
+    others. Both give the same scene, with NaN and infinity. SH bands above ``sh_degree`` are not
+    copied but set to zero.
     """
     where = str(path)
     with open_input(path) as file:
@@ -170,17 +158,11 @@ def _standard_columns(
 ) -> dict[str, NDArray[Any]]:
     """Return writable views of the standard columns to read, in file order."""
     slots = standard_slots(tensors["shN"].shape[1])
-    if sh_degree is not None:
-        read = REST_COUNTS[sh_degree]
-        slots = {
-            name: slot
-            for name, slot in slots.items()
-            if slot.tensor != "shN" or slot.index[0] < read
-        }
+    read = REST_COUNTS[-1 if sh_degree is None else sh_degree]
     return {
-        name: tensors[slots[name].tensor].numpy()[slots[name].rows]
-        for name in types
-        if name in slots
+        name: tensors[tensor].numpy()[column]
+        for name, tensor, column in ((name, *slots[name]) for name in types if name in slots)
+        if tensor != "shN" or column[1] < read
     }
 
 

@@ -104,22 +104,10 @@ class PlyRows:
 def open_rows(
     path: str | os.PathLike[str], *, sh_degree: int | None = None, axes: str | None = None
 ) -> PlyRows:
-    """Open a PLY file without reading its rows.
+    """Open a binary little endian PLY of a 3DGS scene, vertices first, without reading its rows.
 
-    Args:
-        path: The file.
-        sh_degree: SH bands above this degree are left out of scenes; None keeps all.
-        axes: The axes of the file; None for those of PLY files. Scenes are converted to those of
-            PLY files.
-
-    Returns:
-        Its rows.
-
-    Raises:
-        InvalidArgumentError: The axes do not exist.
-        InputNotFoundError: The file does not exist.
-        InputError: It cannot be opened.
-        FileFormatError: It is not a binary little endian PLY of a 3DGS scene, vertices first.
+    Scenes are converted from ``axes``, by default those of PLY files, and lack the SH bands above
+    ``sh_degree``.
     """
     name = os.fspath(path)
     with open_input(Path(path)) as file:
@@ -145,18 +133,9 @@ def open_rows(
 
 
 def join_plys(paths: Sequence[str | os.PathLike[str]], file: BinaryIO) -> int:
-    """Write the concatenated rows of PLY files; memory is one buffer.
+    """Write the concatenated rows of PLY files that have the same columns, and return their number.
 
-    Args:
-        paths: One or more files that :func:`cvtgs.save` has written, with the same columns. The
-            comments are those of the first.
-        file: The output, open for writing.
-
-    Returns:
-        Number of rows.
-
-    Raises:
-        FileFormatError: The files differ in their columns.
+    The comments are those of the first file. Memory is one buffer.
     """
     parts = [open_rows(path) for path in paths]
     first, total = parts[0], sum(part.count for part in parts)

@@ -34,30 +34,7 @@ _NATURAL_TYPES = {
 
 
 def write_ply(scene: GaussianScene, file: BinaryIO) -> None:
-    r"""Write a scene as binary little endian PLY.
-
-    Properties, their order and their types are those of the file that the scene was read from; a
-    scene made in memory gets INRIA's. Memory is one chunk.
-
-    Args:
-        scene: The scene, on any device.
-        file: The output, open for writing.
-
-    Raises:
-        InvalidSceneError: The scene is empty, or a PLY file cannot represent it.
-        OSError: The file cannot be written.
-
-    Example:
-        >>> import io
-        >>> file = io.BytesIO()
-        >>> write_ply(GaussianScene(
-        ...     means=torch.zeros(1, 3), quats=torch.tensor([[1.0, 0, 0, 0]]),
-        ...     log_scales=torch.zeros(1, 3), logit_opacities=torch.zeros(1),
-        ...     sh0=torch.zeros(1, 1, 3), shN=torch.zeros(1, 0, 3),
-        ... ), file)
-        >>> file.getvalue()[:36]
-        b'ply\nformat binary_little_endian 1.0\n'
-    """
+    """Write a scene as binary little endian PLY; memory is one chunk."""
     if len(scene) == 0:
         raise InvalidSceneError("a scene must hold at least one Gaussian to be written, found 0.")
     layout = _output_layout(scene)
@@ -80,8 +57,8 @@ def _fill(block: NDArray[Any], scene: GaussianScene, start: int) -> None:
     with np.errstate(over="ignore"):
         for name in names:
             if name in slots:
-                slot = slots[name]
-                block[name] = tensors[slot.tensor][slot.rows]
+                tensor, column = slots[name]
+                block[name] = tensors[tensor][column]
             elif name in scene.extras:
                 block[name] = _rows(scene.extras[name], start, stop)
 
