@@ -70,9 +70,9 @@ WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _MOST_STRIDE = 252
 
 
-def coefficient(degree: int, number: int) -> str:
-    """Return the name of the attribute of an SH coefficient."""
-    return f"{SPLATS}:SH_DEGREE_{degree}_COEF_{number}"
+def coefficients(degree: int) -> list[str]:
+    """Return the names of the attributes of the SH coefficients of one degree."""
+    return [f"{SPLATS}:SH_DEGREE_{degree}_COEF_{number}" for number in range(2 * degree + 1)]
 
 
 Entry = Annotated[dict[str, Any], Field(default_factory=dict, description="a JSON object")]

@@ -39,7 +39,7 @@ from cvtgs.io.gltf.document import (
     Entries,
     Entry,
     GltfFile,
-    coefficient,
+    coefficients,
     open_gltf,
 )
 from cvtgs.io.spz import decode_spz
@@ -236,19 +236,15 @@ def _read_attributes(file: GltfFile, one: _Placed) -> GaussianScene:
             f"{SCALE} must not be negative, found {scales[row].min():.4g} in element {row:,}"
         )
     opacities = rows(OPACITY, "SCALAR")[:, 0]
-    degree = _degree(file, one)
-    rest = [
-        rows(coefficient(band, number), "VEC3")
-        for band in range(1, degree + 1)
-        for number in range(2 * band + 1)
-    ]
+    bands = range(1, 1 + _degree(file, one))
+    rest = [rows(name, "VEC3") for band in bands for name in coefficients(band)]
     return scene_of(
         Arrays(
             means=means,
             quats=unit_quats(np.roll(quats, 1, axis=1)),
             log_scales=log_scales_of(scales),
             logit_opacities=logits_of(opacities),
-            sh0=rows(coefficient(0, 0), "VEC3"),
+            sh0=rows(coefficients(0)[0], "VEC3"),
             shN=np.stack(rest, axis=1) if rest else np.empty((len(means), 0, 3), np.float32),
         )
     )
@@ -267,12 +263,12 @@ def _degree(file: GltfFile, one: _Placed) -> int:
     names = one.primitive.attributes
     degree = 0
     for band in range(1, len(REST_COUNTS)):
-        wanted = [coefficient(band, number) for number in range(2 * band + 1)]
+        wanted = coefficients(band)
         missing = [name for name in wanted if name not in names]
         if len(missing) == len(wanted):
             continue
         if missing or degree != band - 1:
-            lacking = missing[0] if missing else coefficient(band - 1, 0)
+            lacking = missing[0] if missing else coefficients(band - 1)[0]
             raise file.error(
                 f"Gaussians must have all SH coefficients up to degree {band}, found no {lacking}"
             )

@@ -40,7 +40,7 @@ from cvtgs.io.gltf.document import (
     UNSIGNED_BYTE,
     VERSION,
     WIDTHS,
-    coefficient,
+    coefficients,
 )
 from cvtgs.io.spz import write_spz
 from cvtgs.math.spherical_harmonics import degree_of
@@ -109,7 +109,7 @@ def write_spz_glb(scene: GaussianScene, file: BinaryIO) -> None:
     write_spz(scene, packed, version=_SPZ_VERSION)
     content = packed.getvalue()
     # Keep those that the draft of the extension lists; COLOR_0 has colours and opacities.
-    left_out = (OPACITY, coefficient(0, 0))
+    left_out = (OPACITY, *coefficients(0))
     attributes = [one for one in _attributes(arrays) if one.name not in left_out]
     document = _document(scene, arrays, attributes, compressed=len(content))
     document["buffers"] = [{"byteLength": len(content)}]
@@ -128,24 +128,20 @@ def _attributes(arrays: Arrays) -> list[_Attribute]:
         rgb = to_bytes(255 * colors_of_sh0(arrays.sh0[part]))
         return np.column_stack([rgb, opacity_bytes(arrays.logit_opacities[part])])
 
-    def coefficients(number: int) -> Callable[[slice], Float[np.ndarray, "n 3"]]:
+    def rest(number: int) -> Callable[[slice], Float[np.ndarray, "n 3"]]:
         return lambda part: arrays.shN[part, number]
 
-    attributes = [
+    bands = range(1, 1 + degree_of(arrays.shN.shape[1]))
+    names = [name for band in bands for name in coefficients(band)]
+    return [
         floats(POSITION, "VEC3", lambda part: arrays.means[part]),
         _Attribute(name=COLOR, kind="VEC4", component=UNSIGNED_BYTE, values=colors),
         floats(ROTATION, "VEC4", lambda part: np.roll(arrays.quats[part], -1, axis=1)),
         floats(SCALE, "VEC3", lambda part: scales_of(arrays.log_scales[part])),
         floats(OPACITY, "SCALAR", lambda part: opacities_of(arrays.logit_opacities[part])),
-        floats(coefficient(0, 0), "VEC3", lambda part: arrays.sh0[part]),
+        floats(coefficients(0)[0], "VEC3", lambda part: arrays.sh0[part]),
+        *(floats(name, "VEC3", rest(number)) for number, name in enumerate(names)),
     ]
-    number = 0
-    for degree in range(1, degree_of(arrays.shN.shape[1]) + 1):
-        for index in range(2 * degree + 1):
-            name = coefficient(degree, index)
-            attributes.append(floats(name, "VEC3", coefficients(number)))
-            number += 1
-    return attributes
 
 
 def _document(
