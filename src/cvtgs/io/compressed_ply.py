@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cvtgs.errors import FileFormatError
 from cvtgs.io.arrays import (
+    HALF_RANGE,
     Arrays,
     arrays_of,
     colors_of_sh0,
@@ -25,13 +26,7 @@ from cvtgs.io.arrays import (
 )
 from cvtgs.io.files import open_input
 from cvtgs.io.limits import FORMAT_LIMITS
-from cvtgs.io.ply.header import (
-    Element,
-    Header,
-    header_bytes,
-    read_header,
-    row_dtype,
-)
+from cvtgs.io.ply.header import Element, Header, header_bytes, read_header, row_dtype
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 
@@ -93,17 +88,15 @@ def read_compressed_ply(path: Path) -> GaussianScene:
 def _scene_of(tables: dict[str, Rows]) -> GaussianScene:
     ranges = _ranges(tables["chunk"])
     vertices = tables["vertex"]
-    packed = {name: vertices[name] for name in _PACKED}
-    colors = _unpack(packed["packed_color"], _COLOR_BITS)
-    opacities = (packed["packed_color"] & np.uint32(255)).astype(np.uint8)
-    largest = (packed["packed_rotation"] >> np.uint32(30)).astype(np.int64)
-    others = (_unpack(packed["packed_rotation"], _QUAT_BITS) - np.float32(0.5)) * np.sqrt(
-        np.float32(2)
-    )
+    places, rotations, scales, rgba = (vertices[name] for name in _PACKED)
+    colors = _unpack(rgba, _COLOR_BITS)
+    opacities = (rgba & np.uint32(255)).astype(np.uint8)
+    largest = (rotations >> np.uint32(30)).astype(np.int64)
+    others = (_unpack(rotations, _QUAT_BITS) - np.float32(0.5)) * np.sqrt(np.float32(2))
     arrays = Arrays(
-        means=_between(ranges[:, 0:6], _unpack(packed["packed_position"], _THREE_BITS)),
+        means=_between(ranges[:, 0:6], _unpack(places, _THREE_BITS)),
         quats=restore_largest(largest, others),
-        log_scales=_between(ranges[:, 6:12], _unpack(packed["packed_scale"], _THREE_BITS)),
+        log_scales=_between(ranges[:, 6:12], _unpack(scales, _THREE_BITS)),
         logit_opacities=logits_of_bytes(opacities),
         sh0=sh0_of_colors(_between(ranges[:, 12:18], colors[:, :3])),
         shN=_rest(tables.get("sh"), len(vertices)),
@@ -261,7 +254,7 @@ def _packed(
     words = np.stack(
         [
             _pack(place, _THREE_BITS, high=none),
-            _pack(others * np.sqrt(np.float32(0.5)) + 0.5, _QUAT_BITS, high=largest.astype("u4")),
+            _pack(others * HALF_RANGE + 0.5, _QUAT_BITS, high=largest.astype("u4")),
             _pack(scale, _THREE_BITS, high=none),
             _pack(color, _COLOR_BITS[:3], high=none) << np.uint32(8) | opacities,
         ],

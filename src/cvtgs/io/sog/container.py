@@ -22,6 +22,9 @@ MOST_META_BYTES = 1 << 20
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compression methods whose output zipfile bounds; it unpacks blocks of bzip2 or LZMA whole."""
 
+QUAT_TAG = 252
+"""The last byte of a rotation is this plus the number of its omitted component."""
+
 PALETTE_COLUMNS = 64
 """Entries of the SH palette per row of its image."""
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from pydantic import AfterValidator, Field
 
 from cvtgs.errors import FileFormatError
-from cvtgs.io.arrays import Arrays, logits_of_bytes, restore_largest, scene_of
+from cvtgs.io.arrays import HALF_RANGE, Arrays, logits_of_bytes, restore_largest, scene_of
 from cvtgs.io.files import (
     Document,
     Number,
@@ -25,6 +25,7 @@ from cvtgs.io.sog.container import (
     META,
     MOST_META_BYTES,
     PALETTE_COLUMNS,
+    QUAT_TAG,
     Reader,
     StoredBytes,
     decode_webp,
@@ -37,7 +38,6 @@ from cvtgs.scene import GaussianScene
 _MOST_COUNT = 16383**2
 """Pixels of the largest WebP image."""
 
-_FIRST_TAG = 252
 _LABELS = 1 << 16
 _SPARE_PIXELS = 1 << 16
 
@@ -267,9 +267,9 @@ def _means(images: _Images, part: _Means) -> Float[np.ndarray, "n 3"]:
 
 
 def _quats(stored: UInt8[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Decode three components; the last byte is 252 plus the omitted one, else identity."""
-    tags = stored[:, 3].astype(np.int64) - _FIRST_TAG
-    others = (stored[:, :3].astype(np.float32) / np.float32(127.5) - 1) * np.sqrt(np.float32(0.5))
+    """Decode three components; a last byte below the tags stands for the identity."""
+    tags = stored[:, 3].astype(np.int64) - QUAT_TAG
+    others = (stored[:, :3].astype(np.float32) / np.float32(127.5) - 1) * HALF_RANGE
     quats = restore_largest(np.maximum(tags, 0), others)
     quats[tags < 0] = (1, 0, 0, 0)
     return quats

@@ -21,12 +21,11 @@ from cvtgs.io.arrays import (
     opacity_bytes,
     to_bytes,
 )
-from cvtgs.io.sog.container import META, PALETTE_COLUMNS, encode_webp
+from cvtgs.io.sog.container import META, PALETTE_COLUMNS, QUAT_TAG, encode_webp
 from cvtgs.math.spherical_harmonics import degree_of
 from cvtgs.scene import GaussianScene
 
 _TIME = (1980, 1, 1, 0, 0, 0)  # fixed, so that the same scene gives the same bytes
-_QUAT_TAG = 252
 
 Images = dict[str, UInt8[np.ndarray, "h w 4"]]
 
@@ -129,7 +128,7 @@ def _quats(
     quats: Float[np.ndarray, "n 4"],
 ) -> tuple[UInt8[np.ndarray, "n 3"], UInt8[np.ndarray, "n"]]:
     largest, others = drop_largest(quats)
-    return to_bytes(np.float32(127.5) * (others / HALF_RANGE + 1)), to_bytes(_QUAT_TAG + largest)
+    return to_bytes(np.float32(127.5) * (others / HALF_RANGE + 1)), to_bytes(QUAT_TAG + largest)
 
 
 def _rest(rest: Float[np.ndarray, "n k 3"]) -> tuple[Images, dict[str, Any]]:
@@ -254,10 +253,8 @@ def palette(rows: Float[np.ndarray, "n d"], most: int | None = None) -> Palette:
         away = np.clip(rows - middle, -_LARGEST_SHIFTED, _LARGEST_SHIFTED)
     shifted = torch.from_numpy(away)
     squares = shifted.square()
-    order, starts = (
-        torch.arange(len(rows), device="cpu"),
-        torch.zeros(1, dtype=torch.int64, device="cpu"),
-    )
+    order = torch.arange(len(rows), device="cpu")
+    starts = torch.zeros(1, dtype=torch.int64, device="cpu")
     before = 0
     while before < len(starts) < most:
         before = len(starts)
