@@ -8,8 +8,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import torch
@@ -38,8 +37,7 @@ class _Image:
     translation: tuple[float, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Model:
+class _Model(NamedTuple):
     """A COLMAP camera model that a pinhole camera can replace."""
 
     number: int
@@ -50,16 +48,14 @@ class _Model:
     """Number of focal lengths among them, 1 or 2."""
 
 
-_MODELS: Mapping[str, _Model] = MappingProxyType(
-    {
-        "SIMPLE_PINHOLE": _Model(number=0, parameters=3, focals=1),
-        "PINHOLE": _Model(number=1, parameters=4, focals=2),
-        "SIMPLE_RADIAL": _Model(number=2, parameters=4, focals=1),
-        "RADIAL": _Model(number=3, parameters=5, focals=1),
-        "OPENCV": _Model(number=4, parameters=8, focals=2),
-        "FULL_OPENCV": _Model(number=6, parameters=12, focals=2),
-    }
-)
+_MODELS: Mapping[str, _Model] = {
+    "SIMPLE_PINHOLE": _Model(number=0, parameters=3, focals=1),
+    "PINHOLE": _Model(number=1, parameters=4, focals=2),
+    "SIMPLE_RADIAL": _Model(number=2, parameters=4, focals=1),
+    "RADIAL": _Model(number=3, parameters=5, focals=1),
+    "OPENCV": _Model(number=4, parameters=8, focals=2),
+    "FULL_OPENCV": _Model(number=6, parameters=12, focals=2),
+}
 
 _OTHERS = {
     5: "OPENCV_FISHEYE",
@@ -140,8 +136,8 @@ def _lens_of(
     model: _Model, parameters: Sequence[float], *, width: int, height: int, where: str
 ) -> Lens:
     """Return the pinhole part of a camera."""
-    focals, rest = parameters[: model.focals], parameters[model.focals :]
-    cx, cy, *distortion = rest
+    focals = parameters[: model.focals]
+    cx, cy, *distortion = parameters[model.focals :]
     for value in distortion:
         if not math.isfinite(value):
             raise FileFormatError(f"{where}: the distortion must be finite, found {value}.")
@@ -177,9 +173,6 @@ class _Bytes:
         (count,) = self.take(_COUNT, f"the count of {what}")
         self.check(count * least, f"{count:,} {what}")
         return int(count)
-
-    def skip(self, size: int) -> None:
-        self.file.seek(size, os.SEEK_CUR)
 
     def name(self, what: str) -> str:
         """Read a text that ends with a zero byte."""
@@ -225,7 +218,8 @@ def _images_of_bin(path: Path) -> list[_Image]:
             _, *pose, camera = data.take(_IMAGE, f"image {row}")
             name = data.name(f"image {row}")
             images.append(_checked_image(name, camera, pose=pose, where=f"{path}: image {row}"))
-            data.skip(_POINT_BYTES * data.count(f"points of image {row}", least=_POINT_BYTES))
+            points = data.count(f"points of image {row}", least=_POINT_BYTES)
+            file.seek(_POINT_BYTES * points, os.SEEK_CUR)
     return images
 
 
@@ -298,5 +292,4 @@ def _text_of(content: bytes) -> str:
 
 
 def _wrong(where: str, required: str, line: str) -> FileFormatError:
-    found = line if len(line) <= 60 else f"{line[:57]}..."
-    return FileFormatError(f"{where}: must be {required}, found {found!r}.")
+    return FileFormatError(f"{where}: must be {required}, found {shortened(line, MOST_LETTERS)!r}.")

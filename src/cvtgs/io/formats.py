@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from pkgutil import resolve_name
-from types import MappingProxyType
 from typing import Any, BinaryIO, Literal
 
 import torch
@@ -28,22 +27,20 @@ from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
 
-_READERS: Mapping[str, str] = MappingProxyType(
-    {
-        ".compressed.ply": "cvtgs.io.compressed_ply:read_compressed_ply",
-        ".ply": "cvtgs.io.ply:read_ply",
-        ".spz": "cvtgs.io.spz:read_spz",
-        ".ksplat": "cvtgs.io.splat:read_ksplat",
-        ".splat": "cvtgs.io.splat:read_splat",
-        ".sog": "cvtgs.io.sog:read_sog",
-        "lod-meta.json": "cvtgs.io.sog:read_lod_sog",
-        "meta.json": "cvtgs.io.sog:read_sog",
-        ".glb": "cvtgs.io.gltf:read_gltf",
-        ".gltf": "cvtgs.io.gltf:read_gltf",
-        ".ckpt": "cvtgs.io.checkpoints:read_checkpoint",
-        ".pt": "cvtgs.io.checkpoints:read_checkpoint",
-    }
-)
+_READERS: Mapping[str, str] = {
+    ".compressed.ply": "cvtgs.io.compressed_ply:read_compressed_ply",
+    ".ply": "cvtgs.io.ply:read_ply",
+    ".spz": "cvtgs.io.spz:read_spz",
+    ".ksplat": "cvtgs.io.splat:read_ksplat",
+    ".splat": "cvtgs.io.splat:read_splat",
+    ".sog": "cvtgs.io.sog:read_sog",
+    "lod-meta.json": "cvtgs.io.sog:read_lod_sog",
+    "meta.json": "cvtgs.io.sog:read_sog",
+    ".glb": "cvtgs.io.gltf:read_gltf",
+    ".gltf": "cvtgs.io.gltf:read_gltf",
+    ".ckpt": "cvtgs.io.checkpoints:read_checkpoint",
+    ".pt": "cvtgs.io.checkpoints:read_checkpoint",
+}
 """Readers by suffix, imported when needed; the first suffix that fits counts."""
 
 _ADVICE = (
@@ -62,19 +59,17 @@ _STATES_AXES = (".spz", ".glb", ".gltf")
 _FILE_AXES = {".spz.glb": "luf", ".glb": "luf", ".gltf": "luf", ".usda": "rub"}
 """Axes that a format prescribes, by suffix."""
 
-_WRITERS: Mapping[str, str] = MappingProxyType(
-    {
-        ".compressed.ply": "cvtgs.io.compressed_ply:write_compressed_ply",
-        ".ply": "cvtgs.io.ply:write_ply",
-        ".spz": "cvtgs.io.spz:write_spz",
-        ".splat": "cvtgs.io.splat:write_splat",
-        ".sog": "cvtgs.io.sog:write_sog",
-        ".spz.glb": "cvtgs.io.gltf:write_spz_glb",
-        ".glb": "cvtgs.io.gltf:write_glb",
-        ".gltf": "cvtgs.io.gltf:write_gltf",
-        ".usda": "cvtgs.io.usd:write_usda",
-    }
-)
+_WRITERS: Mapping[str, str] = {
+    ".compressed.ply": "cvtgs.io.compressed_ply:write_compressed_ply",
+    ".ply": "cvtgs.io.ply:write_ply",
+    ".spz": "cvtgs.io.spz:write_spz",
+    ".splat": "cvtgs.io.splat:write_splat",
+    ".sog": "cvtgs.io.sog:write_sog",
+    ".spz.glb": "cvtgs.io.gltf:write_spz_glb",
+    ".glb": "cvtgs.io.gltf:write_glb",
+    ".gltf": "cvtgs.io.gltf:write_gltf",
+    ".usda": "cvtgs.io.usd:write_usda",
+}
 
 READABLE_SUFFIXES = tuple(name for name in _READERS if name.startswith("."))
 WRITABLE_SUFFIXES = tuple(_WRITERS)
@@ -131,13 +126,9 @@ def load(
 
     Example:
         >>> import tempfile
-        >>> scene = GaussianScene(
-        ...     means=torch.zeros(2, 3), quats=torch.tensor([[1.0, 0, 0, 0]] * 2),
-        ...     log_scales=torch.zeros(2, 3), logit_opacities=torch.zeros(2),
-        ...     sh0=torch.zeros(2, 1, 3), shN=torch.zeros(2, 0, 3),
-        ... )
+        >>> from cvtgs.synthetic import scene
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     save(scene, Path(folder) / "two.ply")
+        ...     save(scene("object", 2, sh_degree=0), Path(folder) / "two.ply")
         ...     load(Path(folder) / "two.ply")
         GaussianScene(2 Gaussians, SH degree 0, float32, cpu)
     """
@@ -150,13 +141,11 @@ def load(
             raise InvalidArgumentError(
                 f"a scene is read from a path or an open binary file, found {shown(path)}."
             )
-        format = (
-            None if format is None else _suffix_of(_dotted(format) or "", _READERS, format=format)
-        )
+        if format is not None:
+            format = _suffix_of(_dotted(format) or "", _READERS, format=format)
         with file_of(path, format) as copy:
             return load(
                 copy,
-                format=format,
                 device=device,
                 sh_degree=sh_degree,
                 extras=extras,
@@ -236,14 +225,11 @@ def save(
 
     Example:
         >>> import tempfile
-        >>> scene = GaussianScene(
-        ...     means=torch.zeros(2, 3), quats=torch.tensor([[1.0, 0, 0, 0]] * 2),
-        ...     log_scales=torch.zeros(2, 3), logit_opacities=torch.zeros(2),
-        ...     sh0=torch.zeros(2, 1, 3), shN=torch.zeros(2, 0, 3),
-        ... )
+        >>> from cvtgs.synthetic import scene
+        >>> two = scene("object", 2, sh_degree=0)
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     save(scene, Path(folder) / "two.ply")
-        ...     save(scene, Path(folder) / "two.ply", overwrite=True)
+        ...     save(two, Path(folder) / "two.ply")
+        ...     save(two, Path(folder) / "two.ply", overwrite=True)
     """
     output: AbstractContextManager[BinaryIO]
     if not isinstance(scene, GaussianScene):

@@ -1,8 +1,7 @@
 """Limits of each format, and the data of a scene that is lost in it."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 
 import torch
 
@@ -83,52 +82,50 @@ _GLTF = FormatLimits(
     changed=("scales and opacities as float32 instead of their logarithms and logits",),
 )
 
-FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
-    {
-        ".compressed.ply": FormatLimits(
-            sh_degree=3,
-            antialiased=True,
-            comments=True,
-            ranges={"log_scales": (-20.0, 20.0), "shN": (-4.0, 4.0)},
-            changed=(
-                "rows in Morton order",
-                "positions and scales in 2048 steps (y: 1024) and colours in 256 steps between the "
-                "minimum and maximum of each 256 Gaussians",
-                "rotations in steps of 1/723 per component",
-                "opacities in steps of 1/255",
-            ),
-            changed_bands="view-dependent SH coefficients in steps of 1/32",
+FORMAT_LIMITS: Mapping[str, FormatLimits] = {
+    ".compressed.ply": FormatLimits(
+        sh_degree=3,
+        antialiased=True,
+        comments=True,
+        ranges={"log_scales": (-20.0, 20.0), "shN": (-4.0, 4.0)},
+        changed=(
+            "rows in Morton order",
+            "positions and scales in 2048 steps (y: 1024) and colours in 256 steps between the "
+            "minimum and maximum of each 256 Gaussians",
+            "rotations in steps of 1/723 per component",
+            "opacities in steps of 1/255",
         ),
-        ".spz": _SPZ,
-        ".spz.glb": replace(_SPZ, comments=True),
-        ".glb": _GLTF,
-        ".gltf": _GLTF,
-        ".usda": _GLTF,
-        ".splat": FormatLimits(
-            sh_degree=0,
-            antialiased=False,
-            # colours in [0, 1] plus half a step; scales are stored as float32
-            ranges={"sh0": (-1.7794, 1.7794), "log_scales": SCALE_RANGE},
-            changed=(
-                "colours and opacities in steps of 1/255",
-                "rotations in steps of 1/128 per component",
-            ),
+        changed_bands="view-dependent SH coefficients in steps of 1/32",
+    ),
+    ".spz": _SPZ,
+    ".spz.glb": replace(_SPZ, comments=True),
+    ".glb": _GLTF,
+    ".gltf": _GLTF,
+    ".usda": _GLTF,
+    ".splat": FormatLimits(
+        sh_degree=0,
+        antialiased=False,
+        # colours in [0, 1] plus half a step; scales are stored as float32
+        ranges={"sh0": (-1.7794, 1.7794), "log_scales": SCALE_RANGE},
+        changed=(
+            "colours and opacities in steps of 1/255",
+            "rotations in steps of 1/128 per component",
         ),
-        ".sog": FormatLimits(
-            sh_degree=3,
-            antialiased=True,
-            changed=(
-                "rows in Morton order",
-                "positions in 65,536 steps of sign(x) log(1 + |x|) between minimum and maximum",
-                "scales and colours limited to 256 different values each",
-                "rotations in steps of 1/180 per component",
-                "opacities in steps of 1/255",
-            ),
-            changed_bands="view-dependent SH coefficients limited to 256 different values, in a "
-            "palette of at least half as many entries as Gaussians and at most 65,536",
+    ),
+    ".sog": FormatLimits(
+        sh_degree=3,
+        antialiased=True,
+        changed=(
+            "rows in Morton order",
+            "positions in 65,536 steps of sign(x) log(1 + |x|) between minimum and maximum",
+            "scales and colours limited to 256 different values each",
+            "rotations in steps of 1/180 per component",
+            "opacities in steps of 1/255",
         ),
-    }
-)
+        changed_bands="view-dependent SH coefficients limited to 256 different values, in a "
+        "palette of at least half as many entries as Gaussians and at most 65,536",
+    ),
+}
 """Limits by suffix; ``.ply`` has none."""
 
 _VALUES = {
@@ -165,25 +162,23 @@ def phrases(dropped: Mapping[str, int]) -> tuple[str, ...]:
 
 def dropped_within(scene: GaussianScene, limits: FormatLimits) -> dict[str, int]:
     """Return the lost data, and of clamped data the number of Gaussians, otherwise 0."""
-    return dict(_dropped(scene, limits))
-
-
-def _dropped(scene: GaussianScene, limits: FormatLimits) -> Iterator[tuple[str, int]]:
+    dropped = {}
     if scene.extras:
         names = ", ".join(map(repr, scene.extras))
-        yield f"extra {'columns' if len(scene.extras) > 1 else 'column'} {names}", 0
+        dropped[f"extra {'columns' if len(scene.extras) > 1 else 'column'} {names}"] = 0
     if scene.sh_degree > limits.sh_degree:
         own = f"the scene has degree {scene.sh_degree}"
-        yield f"SH bands above degree {limits.sh_degree} ({own})", 0
+        dropped[f"SH bands above degree {limits.sh_degree} ({own})"] = 0
     if scene.antialiased and not limits.antialiased:
-        yield f"the tag '{ANTIALIASED_TAG}', without which viewers show the scene too sharp", 0
+        tag = f"the tag '{ANTIALIASED_TAG}', without which viewers show the scene too sharp"
+        dropped[tag] = 0
     if scene.dtype == torch.float64:
-        yield "double precision", 0
+        dropped["double precision"] = 0
     rows = writable_rows(scene)
     if not bool(rows.all()):
         count = int((~rows).sum())
         verbs = "is not finite or has" if count == 1 else "are not finite or have"
-        yield f"{counted(count, 'Gaussian')} that {verbs} no rotation", 0
+        dropped[f"{counted(count, 'Gaussian')} that {verbs} no rotation"] = 0
     ranges = dict(limits.ranges)
     if limits.largest_coordinate is not None:
         largest = limits.largest_coordinate(scene)
@@ -194,4 +189,5 @@ def _dropped(scene: GaussianScene, limits: FormatLimits) -> Iterator[tuple[str, 
         beyond = (values < low) | (values > high)
         count = int(beyond.reshape(len(values), -1).any(dim=1).sum()) if values.numel() else 0
         if count:
-            yield f"{_VALUES[name]} outside [{low:.5g}, {high:.5g}], which are clamped", count
+            dropped[f"{_VALUES[name]} outside [{low:.5g}, {high:.5g}], which are clamped"] = count
+    return dropped

@@ -4,8 +4,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, BinaryIO, Literal, get_args
+from typing import Any, BinaryIO, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -22,19 +21,16 @@ Layout = tuple[tuple[str, str], ...]
 MAX_HEADER_BYTES = 1 << 20
 """Longer headers are refused; a 3DGS header has about two thousand bytes."""
 
-_OTHER_FILES = MappingProxyType(
-    {
-        b"\x1f\x8b": "a gzip file; unpack it first, or rename it if it is an .spz",
-        b"PK\x03\x04": "a zip archive; unpack it first, or rename it if it is a .sog",
-        b"<": "a web page; failed downloads often leave one",
-    }
-)
+_OTHER_FILES = {
+    b"\x1f\x8b": "a gzip file; unpack it first, or rename it if it is an .spz",
+    b"PK\x03\x04": "a zip archive; unpack it first, or rename it if it is a .sog",
+    b"<": "a web page; failed downloads often leave one",
+}
 _MAX_COUNT_DIGITS = 18
 _MAX_NAME_LETTERS = 200
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScalarType:
+class ScalarType(NamedTuple):
     """A PLY number type."""
 
     code: str
@@ -43,33 +39,29 @@ class ScalarType:
     """The torch dtype that holds every value and that every torch operation supports."""
 
 
-SCALARS: Mapping[str, ScalarType] = MappingProxyType(
-    {
-        "char": ScalarType(code="i1", dtype=torch.int8),
-        "uchar": ScalarType(code="u1", dtype=torch.uint8),
-        "short": ScalarType(code="i2", dtype=torch.int16),
-        "ushort": ScalarType(code="u2", dtype=torch.int32),
-        "int": ScalarType(code="i4", dtype=torch.int32),
-        "uint": ScalarType(code="u4", dtype=torch.int64),
-        "float": ScalarType(code="f4", dtype=torch.float32),
-        "double": ScalarType(code="f8", dtype=torch.float64),
-    }
-)
+SCALARS: Mapping[str, ScalarType] = {
+    "char": ScalarType("i1", torch.int8),
+    "uchar": ScalarType("u1", torch.uint8),
+    "short": ScalarType("i2", torch.int16),
+    "ushort": ScalarType("u2", torch.int32),
+    "int": ScalarType("i4", torch.int32),
+    "uint": ScalarType("u4", torch.int64),
+    "float": ScalarType("f4", torch.float32),
+    "double": ScalarType("f8", torch.float64),
+}
 """PLY number types by their canonical names."""
 
-TYPE_NAMES: Mapping[str, str] = MappingProxyType(
-    {
-        **{name: name for name in SCALARS},
-        "int8": "char",
-        "uint8": "uchar",
-        "int16": "short",
-        "uint16": "ushort",
-        "int32": "int",
-        "uint32": "uint",
-        "float32": "float",
-        "float64": "double",
-    }
-)
+TYPE_NAMES: Mapping[str, str] = {
+    **{name: name for name in SCALARS},
+    "int8": "char",
+    "uint8": "uchar",
+    "int16": "short",
+    "uint16": "ushort",
+    "int32": "int",
+    "uint32": "uint",
+    "float32": "float",
+    "float64": "double",
+}
 """Canonical names of PLY number types, by all their names."""
 
 FLOAT_TYPES = ("float", "double")
@@ -163,10 +155,7 @@ def read_header(file: BinaryIO, path: str) -> Header:
     )
     _check_unique(elements, path)
     return Header(
-        encoding=encoding,
-        elements=elements,
-        comments=tuple(comments),
-        data_offset=data_offset,
+        encoding=encoding, elements=elements, comments=tuple(comments), data_offset=data_offset
     )
 
 
