@@ -12,13 +12,7 @@ from cvtgs.devices import without_autocast
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn
 from cvtgs.math.parameters import multiply_quats, rotation_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS, rotated_rest
-from cvtgs.scene import (
-    NORMALS,
-    GaussianScene,
-    checked_scenes,
-    concatenate,
-    turned_normals,
-)
+from cvtgs.scene import NORMALS, GaussianScene, checked_scenes, concatenate, turned_normals
 from cvtgs.text import shown
 
 __all__ = [

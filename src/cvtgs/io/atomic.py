@@ -151,9 +151,8 @@ def make_folder(folder: str | os.PathLike[str], *, parents: bool = True) -> None
     try:
         Path(folder).mkdir(parents=parents, exist_ok=True)
     except OSError as error:
-        reason = reason_of(error)
         raise OutputError(
-            f"{os.fspath(folder)}: must be a folder or a new path, found: {reason}."
+            f"{os.fspath(folder)}: must be a folder or a new path, found: {reason_of(error)}."
         ) from error
 
 

@@ -19,7 +19,7 @@ from cvtgs.errors import (
     InvalidArgumentError,
     warn,
 )
-from cvtgs.io.files import is_file, is_folder
+from cvtgs.io.files import is_file, is_folder, read_json
 
 MAX_PIXELS = 1 << 20
 """Largest width and height of images; a larger number is considered damaged."""
@@ -115,7 +115,13 @@ def to_cameras(views: Sequence[View], path: str) -> Cameras:
     """Build cameras of the most frequent image size, and warn once about distortion."""
     sizes = Counter((view.lens.width, view.lens.height) for view in views)
     (width, height), _ = sizes.most_common(1)[0]
-    _warn_of_distortion(views, path)
+    distorted = sum(view.lens.distorted for view in views)
+    if distorted:
+        warn(
+            f"{path}: left out the lens distortion of {distorted:,} of {len(views):,} cameras, "
+            f"since rendering uses pinhole cameras; compare with undistorted photographs.",
+            DroppedDataWarning,
+        )
     viewmats = np.stack([view.viewmat for view in views])
     intrinsics = np.stack([_intrinsics(view.lens, width=width, height=height) for view in views])
     return Cameras(
@@ -130,16 +136,6 @@ def to_cameras(views: Sequence[View], path: str) -> Cameras:
 def _intrinsics(lens: Lens, *, width: int, height: int) -> Float[np.ndarray, "3 3"]:
     x, y = width / lens.width, height / lens.height
     return np.array([[lens.fx * x, 0, lens.cx * x], [0, lens.fy * y, lens.cy * y], [0, 0, 1]])
-
-
-def _warn_of_distortion(views: Sequence[View], path: str) -> None:
-    count = sum(view.lens.distorted for view in views)
-    if count:
-        warn(
-            f"{path}: left out the lens distortion of {count:,} of {len(views):,} cameras, since "
-            f"rendering uses pinhole cameras; compare with undistorted photographs.",
-            DroppedDataWarning,
-        )
 
 
 def load_cameras(path: str | os.PathLike[str], *, split: Split | None = None) -> Cameras:
@@ -233,7 +229,6 @@ def _file_views(path: Path, split: Split | None) -> list[View]:
             f"{path}: a camera file must be JSON (.json) or part of a COLMAP model "
             f"({', '.join(_COLMAP_FILES)}), found neither."
         )
-    from cvtgs.io.files import read_json  # noqa: PLC0415
     from cvtgs.io.transforms import inria_views, transforms_views  # noqa: PLC0415
 
     content = read_json(path)

@@ -148,11 +148,10 @@ def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
     prefix = _prefix(mapping)
     keys: dict[str, str] = {}
     for key in mapping:
-        if not isinstance(key, str):
-            raise InvalidSceneError(f"the names must be {_KNOWN}, found {shown(key)}.")
-        if not key.startswith(prefix):
+        is_text = isinstance(key, str)
+        if is_text and not key.startswith(prefix):
             continue
-        name = _TENSORS.get(key.removeprefix(prefix))
+        name = _TENSORS.get(key.removeprefix(prefix)) if is_text else None
         if name is None:
             raise InvalidSceneError(f"the names must be {_KNOWN}, found {shown(key)}.")
         if name in keys:

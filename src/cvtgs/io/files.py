@@ -13,13 +13,7 @@ import pydantic
 from pydantic import AllowInfNan, BeforeValidator, Field, Strict
 from torch import Tensor
 
-from cvtgs.errors import (
-    FileFormatError,
-    InputError,
-    InputNotFoundError,
-    input_errors,
-    reason_of,
-)
+from cvtgs.errors import FileFormatError, InputError, InputNotFoundError, input_errors, reason_of
 from cvtgs.text import shown
 
 _POINTER = b"version https://git-lfs."

@@ -6,7 +6,7 @@ import socket
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 from cvtgs.errors import OutputBusyError, OutputError, reason_of
@@ -32,9 +32,8 @@ def output_lock(path: str | os.PathLike[str]) -> Iterator[None]:
             "work; wait until it ends, or choose another output."
         ) from error
     except (OSError, NotImplementedError) as error:
-        reason = reason_of(error)
         raise OutputError(
-            f"{os.fspath(path)}: its folder must allow a lock file, found: {reason}."
+            f"{os.fspath(path)}: its folder must allow a lock file, found: {reason_of(error)}."
         ) from error
     is_soft = isinstance(lock, SoftFileLock)  # its file has its own content
     try:
@@ -56,10 +55,8 @@ def folder_lock(path: str | os.PathLike[str]) -> Iterator[None]:
     If no file can be created there, nothing is locked, so that the writer reports the fault.
     """
     place = lock_path(path).parent
-    if place.is_dir() and os.access(place, os.W_OK | os.X_OK):
-        with output_lock(path):
-            yield
-    else:
+    usable = place.is_dir() and os.access(place, os.W_OK | os.X_OK)
+    with output_lock(path) if usable else nullcontext():
         yield
 
 

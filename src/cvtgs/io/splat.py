@@ -207,8 +207,7 @@ def _read_section(
     file.seek(here + wanted)
     means = rows["mean"].astype(np.float32)
     if level:
-        bucket = _buckets(section, lengths)
-        bucket = bucket[: section.used]
+        bucket = _buckets(section, lengths)[: section.used]
         most = int(bucket.max(initial=0))
         if section.bucket_bytes < 12 or len(bucket) < section.used or most >= section.buckets:
             raise FileFormatError(

@@ -10,15 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from cvtgs.errors import FileFormatError, InvalidArgumentError
-from cvtgs.io.cameras import (
-    SPLITS,
-    Lens,
-    Split,
-    View,
-    checked_lens,
-    hold_out,
-    viewmat_of_pose,
-)
+from cvtgs.io.cameras import SPLITS, Lens, Split, View, checked_lens, hold_out, viewmat_of_pose
 from cvtgs.io.files import (
     Document,
     Items,
@@ -150,13 +142,10 @@ def transforms_views(content: Any, path: Path, split: Split | None) -> list[View
                 f"pass the folder to read both splits."
             )
         return views
-    lists = {
-        "train": document.train_filenames,
-        "val": document.val_filenames,
-        "test": document.test_filenames,
-    }
-    if any(names is not None for names in lists.values()):
-        return _listed(views, lists[split], f"{split}_filenames", path)
+    lists = (document.train_filenames, document.val_filenames, document.test_filenames)
+    if any(names is not None for names in lists):
+        key = f"{split}_filenames"
+        return _listed(views, getattr(document, key), key, path)
     return hold_out(views, split)
 
 

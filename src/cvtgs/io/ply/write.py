@@ -9,12 +9,7 @@ from torch import Tensor
 
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError, warn
 from cvtgs.io.ply.header import FLOAT_TYPES, SCALARS, Layout, header_bytes, row_dtype
-from cvtgs.io.ply.properties import (
-    dtype_of,
-    is_standard,
-    rest_index,
-    standard_slots,
-)
+from cvtgs.io.ply.properties import dtype_of, is_standard, rest_index, standard_slots
 from cvtgs.scene import FLAT_LOG_SCALE, NORMALS, GaussianScene
 
 CHUNK_BYTES = 1 << 20

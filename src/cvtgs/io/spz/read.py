@@ -122,7 +122,15 @@ def decode_spz(
     content: bytes, path: Path | str, *, axes: str | None = None, trust_sizes: bool = False
 ) -> GaussianScene:
     """Decode the bytes of an ``.spz`` file as :func:`read_spz` does."""
-    found = _parsed(content, path, trust_sizes=trust_sizes)
+    if content[:2] == _GZIP:
+        found = _read_gzip(content, path, trust_sizes=trust_sizes)
+    elif content[:4] == MAGIC.to_bytes(4, "little"):
+        found = _read_version_4(content, path, trust_sizes=trust_sizes)
+    else:
+        raise FileFormatError(
+            f"{path}: an .spz file must start with the magic number of gzip or SPZ, "
+            f"found {content[:4]!r}."
+        )
     header, blocks = found.header, found.blocks
     if header.sh_degree > 3:
         warn(
@@ -168,18 +176,6 @@ def _quats(stored: UInt8[np.ndarray, "n b"]) -> Float[np.ndarray, "n 4"]:
     sizes = (fields & 511).astype(np.float32) * (HALF_RANGE / 511)
     others = np.where(fields & 512, -sizes, sizes)
     return np.roll(restore_largest((words >> 30).astype(np.int64), others), 1, axis=1)
-
-
-def _parsed(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Content:
-    """Check and decompress a file."""
-    if content[:2] == _GZIP:
-        return _read_gzip(content, path, trust_sizes=trust_sizes)
-    if content[:4] == MAGIC.to_bytes(4, "little"):
-        return _read_version_4(content, path, trust_sizes=trust_sizes)
-    raise FileFormatError(
-        f"{path}: an .spz file must start with the magic number of gzip or SPZ, "
-        f"found {content[:4]!r}."
-    )
 
 
 def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Content:

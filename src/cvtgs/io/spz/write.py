@@ -12,14 +12,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.io.arrays import (
-    HALF_RANGE,
-    Arrays,
-    arrays_of,
-    drop_largest,
-    opacity_bytes,
-    to_bytes,
-)
+from cvtgs.io.arrays import HALF_RANGE, Arrays, arrays_of, drop_largest, opacity_bytes, to_bytes
 from cvtgs.io.axes import AXES, SCENE_AXES, checked_axes
 from cvtgs.io.spz.read import (
     ANTIALIASED_FLAG,
@@ -104,8 +97,7 @@ def _write_fourth(arrays: Arrays, header: SpzHeader, axes: int, file: BinaryIO) 
     packed = []
     for size, parts in zip(sizes, _blocks(arrays, header), strict=False):  # no SH, no block
         stream = ZstdCompressor(level=_ZSTD_LEVEL).compressobj(size=size)
-        packed.append(b"".join([*(stream.compress(part.tobytes()) for part in parts)]))
-        packed[-1] += stream.flush()
+        packed.append(b"".join(stream.compress(part.tobytes()) for part in parts) + stream.flush())
     header = replace(header, streams=len(sizes), flags=header.flags | EXTENSIONS_FLAG)
     extension = struct.pack("<III", AXES_EXTENSION, 4, axes)
     start = FOURTH_HEADER_BYTES + len(extension)
