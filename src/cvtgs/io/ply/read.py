@@ -113,29 +113,26 @@ def assemble(
         # numpy's zeros take no memory until they are written to; torch's do.
         zeros = np.zeros(tensors["shN"].shape, tensors["shN"].numpy().dtype)
         tensors["shN"] = torch.from_numpy(zeros)
-    standard = _standard_columns(tensors, types, sh_degree)
-    columns = {**standard, **{name: column.numpy() for name, column in extras.items()}}
-    normal_names = tuple(name for name in NORMALS if with_extras and name in types)
+    columns = _standard_columns(tensors, types, sh_degree)
+    columns |= {name: column.numpy() for name, column in extras.items()}
+    skipped = [name for name in NORMALS if with_extras and name in types]  # as long as all are 0
     if "scale_2" not in types:
         tensors["log_scales"][:, 2] = FLAT_LOG_SCALE
-    normals: dict[str, Tensor] = {}
     start = 0
     for rows in chunks:
         stop = start + len(rows)
-        if not normals and any(rows[name].any() for name in normal_names):
-            normals = {
-                name: torch.zeros(count, dtype=SCALARS[types[name]].dtype, device="cpu")
-                for name in normal_names
-            }
-            columns.update({name: normal.numpy() for name, normal in normals.items()})
+        if any(rows[name].any() for name in skipped):
+            for name in skipped:
+                extras[name] = torch.zeros(count, dtype=SCALARS[types[name]].dtype, device="cpu")
+                columns[name] = extras[name].numpy()
+            skipped = []
         with np.errstate(over="ignore", invalid="ignore"):
             for name, column in columns.items():
                 column[start:stop] = rows[name]
         start = stop
-    carried = {**extras, **normals}
     return GaussianScene(
         **tensors,
-        extras={name: carried[name] for name in types if name in carried},
+        extras={name: extras[name] for name in types if name in extras},
         comments=comments,
         layout=layout,
     )
