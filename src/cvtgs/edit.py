@@ -15,15 +15,7 @@ from cvtgs.math.spherical_harmonics import REST_COUNTS, rotated_rest
 from cvtgs.scene import NORMALS, GaussianScene, checked_scenes, concatenate, turned_normals
 from cvtgs.text import shown
 
-__all__ = [
-    "Motion",
-    "Sphere",
-    "crop",
-    "drop_faint",
-    "drop_large",
-    "merge",
-    "move",
-]
+__all__ = ["Motion", "Sphere", "crop", "drop_faint", "drop_large", "merge", "move"]
 
 _NO_TURN = (1.0, 0.0, 0.0, 0.0)
 _NO_SHIFT = (0.0, 0.0, 0.0)
@@ -306,9 +298,9 @@ def merge(scenes: Iterable[GaussianScene]) -> GaussianScene:
         GaussianScene(15 Gaussians, SH degree 2, float32, cpu)
     """
     scenes = checked_scenes(scenes, "merging")
-    common = set.intersection(*({*scene.extras, *NORMALS} for scene in scenes))
-    common &= {name for scene in scenes for name in scene.extras}
-    missing = sorted({name for scene in scenes for name in scene.extras} - common)
+    found = {name for scene in scenes for name in scene.extras}
+    common = found.intersection(*({*scene.extras, *NORMALS} for scene in scenes))
+    missing = sorted(found - common)
     if missing:
         warn(
             f"left out {'columns' if len(missing) > 1 else 'column'} "

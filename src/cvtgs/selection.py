@@ -14,21 +14,11 @@ from cvtgs.text import shown
 def row_numbers(
     rows: slice | Sequence[int] | Tensor, count: int, *, things: str, device: torch.device
 ) -> Int[Tensor, "m"]:
-    """Return the numbers of the selected rows, from 0 on.
+    """Return the numbers of the selected rows, from 0 on, as int32 or int64.
 
-    Args:
-        rows: A slice, a mask, or row numbers, of which negative ones count from the end.
-        count: Number of rows to select from.
-        things: Name of the rows in errors, in the plural.
-        device: Device of the result. Numbers on other devices than CPUs are not checked, since
-            that would wait for the device.
-
-    Returns:
-        Row numbers, int32 or int64.
-
-    Raises:
-        InvalidArgumentError: A mask has not one entry per row, a number is out of range, or
-            ``rows`` is something else.
+    ``rows`` is a slice, a mask, or row numbers, of which negative ones count from the end.
+    ``things`` names them in errors. Numbers on other devices than CPUs are not checked, since that
+    would wait for the device.
     """
     if isinstance(rows, slice):
         these = range(count)[rows]

@@ -251,10 +251,7 @@ def save(
     scene = change_axes(scene, SCENE_AXES, axes)
     dropped = losses(scene, named).dropped
     if dropped:
-        warn(
-            f"{name}: files of this format do not hold {'; '.join(dropped)}.",
-            DroppedDataWarning,
-        )
+        warn(f"{name}: files of this format do not hold {'; '.join(dropped)}.", DroppedDataWarning)
     options = {"version": spz_version, "axes": axes} if suffix == ".spz" else {}
     write: Callable[..., None] = resolve_name(_WRITERS[suffix])
     with output as file:
