@@ -18,7 +18,6 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<")
 """Markers; when the styles are used up too, points are marked, in the next shape."""
 
 DPI = 100
-SMALLEST_SIDE = 100
 
 _LABEL_POSITIONS = (
     (0, 7, "center", "bottom"),
@@ -38,15 +37,10 @@ Extents = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Series:
-    """One line.
+    """One line; it has gaps where ``y`` is not finite.
 
-    Attributes:
-        name: Name in the legend; series of the same name share a style in all panels.
-        x: x coordinates of the points.
-        y: y coordinates of the points; the line has gaps where they are not finite.
-        markers: Whether the points are marked.
-        labels: Text at each point; empty for none.
-        hollow: Whether each point is hollow and not part of the line; empty for none.
+    Series of the same name share a style in all panels. Labels are texts at the points; hollow
+    points are not part of the line.
     """
 
     name: str
@@ -59,17 +53,7 @@ class Series:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Panel:
-    """One pair of axes.
-
-    Attributes:
-        series: At least one.
-        title: Title above the panel.
-        x_label: Label of the x axis, with unit.
-        y_label: Label of the y axis, with unit.
-        x_ticks: Ticks of the x axis; chosen by matplotlib if empty.
-        log_x: Whether the x axis is logarithmic.
-        log_y: Whether the y axis is logarithmic.
-    """
+    """One pair of axes; matplotlib chooses the ticks if none are given."""
 
     series: Sequence[Series]
     title: str = ""
@@ -77,7 +61,6 @@ class Panel:
     y_label: str = ""
     x_ticks: Sequence[float] = ()
     log_x: bool = False
-    log_y: bool = False
 
 
 def line_chart(
@@ -92,7 +75,6 @@ def line_chart(
 
     The same arguments give the same bytes with the same matplotlib.
     """
-    _check(panels, columns, size=(width, height))
     figure = _figure(width / DPI, height / DPI)
     styles = _styles(panels)
     rows, across = math.ceil(len(panels) / columns), min(columns, len(panels))
@@ -165,8 +147,6 @@ def _draw(axes: Any, panel: Panel, styles: dict[str, dict[str, str]]) -> dict[st
     axes.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
     if panel.log_x:
         axes.set_xscale("log")
-    if panel.log_y:
-        axes.set_yscale("log")
     if any(series.labels for series in panel.series):
         axes.margins(0.08, 0.12)  # before the ticks, which may widen the axis
     if panel.x_ticks:
@@ -232,41 +212,3 @@ def _shared(one: Extents, other: Extents) -> float:
     width = min(one[2], other[2]) - max(one[0], other[0])
     height = min(one[3], other[3]) - max(one[1], other[1])
     return max(0.0, width) * max(0.0, height)
-
-
-def _check(panels: Sequence[Panel], columns: int, *, size: tuple[int, int]) -> None:
-    if columns < 1 or min(size) < SMALLEST_SIDE:
-        raise InvalidArgumentError(
-            f"a chart must have at least 1 column and {SMALLEST_SIDE} pixels on each side, "
-            f"found {columns} and {size[0]} x {size[1]}."
-        )
-    if not panels:
-        raise InvalidArgumentError("a chart needs at least one panel, found none.")
-    for panel in panels:
-        if not panel.series:
-            raise InvalidArgumentError(
-                f"every panel needs at least one series, found none in {panel.title!r}."
-            )
-        for series in panel.series:
-            _check_series(series, panel)
-
-
-def _check_series(series: Series, panel: Panel) -> None:
-    if len(series.x) != len(series.y) or len(series.x) == 0:
-        raise InvalidArgumentError(
-            f"series {series.name!r} must have as many x as y, and at least one; "
-            f"found {len(series.x)} and {len(series.y)}."
-        )
-    for name, number in (("labels", len(series.labels)), ("hollow flags", len(series.hollow))):
-        if number not in (0, len(series.x)):
-            raise InvalidArgumentError(
-                f"series {series.name!r} must have {name} for all points or none; "
-                f"found {number} for {len(series.x)}."
-            )
-    for axis, is_log, values in (("x", panel.log_x, series.x), ("y", panel.log_y, series.y)):
-        bad = [number for number, value in enumerate(values) if value <= 0] if is_log else []
-        if bad:
-            raise InvalidArgumentError(
-                f"series {series.name!r} must be above 0 on the logarithmic {axis} axis; "
-                f"{len(bad)} values are not, the first is {axis}[{bad[0]}] = {values[bad[0]]:g}."
-            )
