@@ -13,9 +13,8 @@ from cvtgs.budget import CostModel, Found
 from cvtgs.budget.calibrate import CANDIDATES
 from cvtgs.budget.costs import FEATURES
 from cvtgs.cli.display import target_note
+from cvtgs.cli.goals import STARTED, check_goals, choose_preset, read_seconds
 from cvtgs.cli.main import build_parser, main
-from cvtgs.cli.simplify import check_goals
-from cvtgs.cli.time_budget import STARTED, choose_preset, read_seconds
 from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.progress import silent
 from cvtgs.text import counted
@@ -46,7 +45,7 @@ def measured(monkeypatch) -> list[bool]:
 
     monkeypatch.setattr(cvtgs.budget, "cost_model", known)
     monkeypatch.setattr("cvtgs.budget.calibrate.is_calibrated", lambda device: len(asked) > 0)
-    monkeypatch.setattr("cvtgs.cli.time_budget.time.perf_counter", lambda: STARTED)
+    monkeypatch.setattr("cvtgs.cli.goals.time.perf_counter", lambda: STARTED)
     return asked
 
 
@@ -156,7 +155,7 @@ def test_a_time_budget_accounts_for_the_other_settings(scene, monkeypatch, words
     model = CostModel(rates=rates)
     monkeypatch.setattr(cvtgs.budget, "cost_model", lambda *_, **__: model)
     monkeypatch.setattr("cvtgs.budget.calibrate.is_calibrated", lambda device: True)
-    monkeypatch.setattr("cvtgs.cli.time_budget.time.perf_counter", lambda: STARTED)
+    monkeypatch.setattr("cvtgs.cli.goals.time.perf_counter", lambda: STARTED)
     budget = options("--rho", "0.1", "--time-budget", "5s", *words)
     check_goals(budget)
     if preset is None:
@@ -182,7 +181,7 @@ def test_the_machine_is_measured_once_or_on_request(scene, measured, capsys):
 
 @pytest.mark.usefixtures("measured")
 def test_a_budget_shorter_than_start_up_is_refused(scene, monkeypatch):
-    monkeypatch.setattr("cvtgs.cli.time_budget.time.perf_counter", lambda: STARTED + 60)
+    monkeypatch.setattr("cvtgs.cli.goals.time.perf_counter", lambda: STARTED + 60)
     with pytest.raises(GoalError, match=r"fits into 5 s: starting and reading took 60\.0 s\."):
         choose_preset(options("--count", "10", "--time-budget", "5s"), scene, {}, silent)
 

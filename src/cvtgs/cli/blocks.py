@@ -3,24 +3,12 @@
 import argparse
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from cvtgs.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from cvtgs.outofcore import Workers
-
-
-class BlockWorkers(NamedTuple):
-    """Workers that process blocks, and their memory.
-
-    Attributes:
-        workers: Processes or a cluster; None for this process alone.
-        memory: Bytes that each worker may use.
-    """
-
-    workers: "Workers | None"
-    memory: int
 
 
 def add_block_options(parser: argparse.ArgumentParser) -> None:
@@ -62,15 +50,17 @@ def memory_of(options: argparse.Namespace) -> int:
 
 
 @contextmanager
-def block_workers(options: argparse.Namespace, memory: int) -> Iterator[BlockWorkers]:
-    """Start processes on this machine, or connect to a cluster."""
+def block_workers(
+    options: argparse.Namespace, memory: int
+) -> Iterator[tuple["Workers | None", int]]:
+    """Return workers, None for this process alone, and the bytes that each may use."""
     from cvtgs.outofcore import ClusterWorkers, LocalWorkers, connect, worker_count
 
     with ExitStack() as stack:
         if options.scheduler is not None:
             client = stack.enter_context(closing(connect(options.scheduler)))
-            yield BlockWorkers(ClusterWorkers(client), memory)
+            yield ClusterWorkers(client), memory
         elif (count := worker_count(memory, options.workers)) > 1:
-            yield BlockWorkers(stack.enter_context(LocalWorkers(count)), memory // count)
+            yield stack.enter_context(LocalWorkers(count)), memory // count
         else:
-            yield BlockWorkers(None, memory)
+            yield None, memory

@@ -23,12 +23,7 @@ from cvtgs.cli.options import (
     read_ratios,
     read_settings,
 )
-from cvtgs.cli.streams import (
-    add_stream_options,
-    check_stream_options,
-    stream_blocks,
-    stream_levels,
-)
+from cvtgs.cli.streams import add_stream_options, check_stream_options, stream_blocks, stream_levels
 from cvtgs.cli.view import check_page, write_page
 from cvtgs.text import printable
 
@@ -78,8 +73,6 @@ def levels(options: argparse.Namespace) -> None:
     axes = read_axes(options.axes)
     default = PLAIN_RHOS if options.stream is None else STREAM_RHOS
     rhos = sorted(read_ratios(options.rho or default), reverse=True)
-    for rho in rhos:
-        cvtgs.target_count(1, rho)
     check_suffix(options.suffix)
     suffix = options.suffix or ".ply"
     names = cvtgs.levels.level_names(rhos, suffix)

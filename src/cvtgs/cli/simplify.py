@@ -11,6 +11,7 @@ import cvtgs
 from cvtgs.cli.blocks import add_block_options, block_workers, memory_of
 from cvtgs.cli.cameras import check_split, read_cameras
 from cvtgs.cli.display import TIE, progress_bars, report_notes, target_note
+from cvtgs.cli.goals import STARTED, check_goals, choose_preset, has_target, search_target
 from cvtgs.cli.jobs import Outcome, SceneJob, add_paths, check_paths, open_jobs, run_jobs
 from cvtgs.cli.options import (
     CAMERA_FILES,
@@ -25,8 +26,6 @@ from cvtgs.cli.options import (
     read_scene,
     read_settings,
 )
-from cvtgs.cli.target import check_target, has_target, search_target
-from cvtgs.cli.time_budget import STARTED, check_time_budget, choose_preset
 from cvtgs.errors import (
     ConfigError,
     FileFormatError,
@@ -148,8 +147,6 @@ def simplify(options: argparse.Namespace) -> None:
     config = cvtgs.SimplifyConfig.compose(
         file=options.config, preset=preset_of(options), settings=settings
     )
-    if options.rho is not None:
-        cvtgs.target_count(1, options.rho)
     with open_jobs(options) as jobs:
         if options.report is not None and len(jobs) > 1:
             raise InvalidArgumentError(f"--report needs exactly one scene, found {len(jobs)}.")
@@ -276,12 +273,6 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
     return {"refine.steps": str(steps), "refine.seconds": str(seconds)}
 
 
-def check_goals(options: argparse.Namespace) -> None:
-    """Check the targets and the time budget, and raise for options that exclude them."""
-    check_target(options)
-    check_time_budget(options, has_target=has_target(options))
-
-
 def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int | None:
     """Return the bytes for simplifying in blocks; None if blocks are not needed or not possible."""
     from cvtgs.outofcore import check_config
@@ -342,21 +333,21 @@ def _simplify_blocks(
 ) -> "SimplifyReport":
     """Simplify a file block by block, on this machine or on a cluster."""
     axes = read_axes(options.axes)
-    with block_workers(options, memory) as blocks:
+    with block_workers(options, memory) as (workers, share):
         return cvtgs.outofcore.simplify_file(
             options.input,
             options.output,
             options.rho,
             count=options.count,
             max_count=options.max_count,
-            memory=blocks.memory,
+            memory=share,
             boxes=() if options.keep is None else cvtgs.boxes.read_boxes(options.keep),
             sh_degree=options.sh_degree,
             source_axes=axes.source,
             output_axes=axes.target,
             simplifier=simplifier,
             cameras=read_cameras(options),
-            workers=blocks.workers,
+            workers=workers,
             overwrite=options.overwrite,
             listener=listener,
         )

@@ -167,20 +167,23 @@ def stream_blocks(
         raise InvalidArgumentError(
             "blocks cannot be used with --cameras, which need the whole scene."
         )
-    with progress_bars(quiet=options.quiet) as listener, block_workers(options, memory) as blocks:
+    with (
+        progress_bars(quiet=options.quiet) as listener,
+        block_workers(options, memory) as (workers, share),
+    ):
         report = stream_file(
             options.input,
             options.output,
             rhos,
             kind=options.stream,
-            memory=blocks.memory,
+            memory=share,
             chunk_gaussians=options.chunk or CHUNK_GAUSSIANS,
             environment_radii=options.environment,
             transform=read_transform(options),
             axes=(axes.source or SCENE_AXES, axes.target or SCENE_AXES),
             sh_degree=options.sh_degree,
             simplifier=cvtgs.Simplifier(checkpoint, config=config, device="cpu"),
-            workers=blocks.workers,
+            workers=workers,
             overwrite=options.overwrite,
             listener=listener,
         )

@@ -91,7 +91,6 @@ def view(options: argparse.Namespace) -> None:
     from cvtgs.viewer import SceneViewer, ViewerServer, check_viewer
 
     check_viewer()
-    cvtgs.target_count(1, options.rho)
     preset = options.preset or "draft"
     cvtgs.SimplifyConfig.compose(preset=preset)
     if not 0 < options.port < 1 << 16:

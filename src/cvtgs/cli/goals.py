@@ -1,19 +1,25 @@
-"""``--time-budget``: choose the best preset that finishes in time."""
+"""Goals of ``cvtgs simplify`` besides a count: a time budget, or a quality to reach."""
 
 import argparse
 import math
 import sys
 import time
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, NamedTuple
 
 import cvtgs
 from cvtgs.cli.display import say
-from cvtgs.errors import GoalError, InvalidArgumentError
+from cvtgs.errors import DroppedDataWarning, GoalError, InvalidArgumentError
 
 if TYPE_CHECKING:
+    from cvtgs.budget import Found
+    from cvtgs.cameras import Cameras
     from cvtgs.progress import ProgressListener
     from cvtgs.scene import GaussianScene
+    from cvtgs.simplifier import Simplifier
 
 STARTED = time.perf_counter()
 """Approximate start of this process, from which a time budget counts."""
@@ -42,12 +48,22 @@ class ChosenPreset(NamedTuple):
         return [f"The run took {seconds:.1f} s, where {self.left:.1f} s were left; {advice}."]
 
 
-def check_time_budget(options: argparse.Namespace, *, has_target: bool) -> None:
-    """Check ``--time-budget``, and raise for options that exclude it or need it."""
+def has_target(options: argparse.Namespace) -> bool:
+    """Return whether a quality is to be reached."""
+    return options.target_psnr is not None or options.target_ssim is not None
+
+
+def check_goals(options: argparse.Namespace) -> None:
+    """Check the goals, and raise for options that exclude them or need them."""
+    if has_target(options):
+        from cvtgs.budget.count import checked_target
+
+        if options.keep is not None:
+            raise InvalidArgumentError("--keep needs --rho, --count or --max-count.")
+        checked_target(options.target_psnr, ssim=options.target_ssim)
     if options.time_budget is None:
-        for name in ("recalibrate", "shipped_rates"):
-            if getattr(options, name):
-                option = name.replace("_", "-")
+        for option in ("recalibrate", "shipped-rates"):
+            if getattr(options, option.replace("-", "_")):
                 raise InvalidArgumentError(f"--{option} needs --time-budget.")
         return
     if options.recalibrate and options.shipped_rates:
@@ -58,7 +74,7 @@ def check_time_budget(options: argparse.Namespace, *, has_target: bool) -> None:
         "--config": options.config is not None,
         "--ckpt": options.ckpt not in ("auto", "none"),
         "--refine": options.refine is not None or options.refine_steps is not None,
-        "--target-psnr and --target-ssim": has_target,
+        "--target-psnr and --target-ssim": has_target(options),
     }
     wrong = [name for name, is_given in excluded.items() if is_given]
     if wrong:
@@ -123,3 +139,57 @@ def choose_preset(
         f"{choice.seconds:.1f} s after {spent:.1f} s of starting and reading."
     )
     return ChosenPreset(choice.preset, reason, budget - spent, not options.shipped_rates)
+
+
+def search_target(
+    options: argparse.Namespace,
+    scene: "GaussianScene",
+    simplifier: "Simplifier",
+    *,
+    cameras: "Cameras | None",
+    axes: str | None,
+    listener: "ProgressListener",
+) -> "Found":
+    """Search for the smallest scene whose file, with the given axes, reaches the quality."""
+    is_rounded = rounds(options.output)
+    try:
+        return cvtgs.budget.find_count(
+            scene,
+            psnr=options.target_psnr,
+            ssim=options.target_ssim,
+            simplifier=simplifier,
+            cameras=cameras,
+            heldout=None if simplifier.config.uses_images else cameras,
+            written=read_back(options.output, axes=axes) if is_rounded else lambda small: small,
+            listener=listener,
+        )
+    except GoalError as error:
+        if not is_rounded:
+            raise
+        raise GoalError(
+            f"{error} These are scores of files of this format, which rounds; a plain .ply does "
+            f"not."
+        ) from error
+
+
+def rounds(path: Path) -> bool:
+    """Return whether a scene changes when it is written to a file and read again."""
+    from cvtgs.io.formats import READABLE_SUFFIXES
+    from cvtgs.io.limits import FORMAT_LIMITS
+
+    limited = tuple(suffix for suffix in READABLE_SUFFIXES if suffix in FORMAT_LIMITS)
+    return path.name.lower().endswith(limited)
+
+
+def read_back(path: Path, *, axes: str | None = None) -> "Callable[[GaussianScene], GaussianScene]":
+    """Return a function that writes a scene to a temporary file of this name and reads it again."""
+
+    def read(scene: "GaussianScene") -> "GaussianScene":
+        with TemporaryDirectory() as folder:
+            file = Path(folder) / path.name
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DroppedDataWarning)  # the output file warns
+                cvtgs.io.save(scene, file, axes=axes)
+            return cvtgs.io.load(file, device=scene.device, axes=axes, trust_sizes=True)
+
+    return read
