@@ -27,16 +27,10 @@ def printable(text: str, encoding: str = "utf-8") -> str:
     try:
         text.encode(encoding)
     except UnicodeEncodeError:
-        return "".join(letter if _fits(letter, encoding) else _escaped(letter) for letter in text)
+        return "".join(
+            letter if letter.encode(encoding, "ignore") else _escaped(letter) for letter in text
+        )
     return text
-
-
-def _fits(letter: str, encoding: str) -> bool:
-    try:
-        letter.encode(encoding)
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _escaped(letter: str) -> str:

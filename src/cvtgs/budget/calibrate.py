@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -70,15 +71,8 @@ Calibration = Callable[[], CostModel]
 class Trial:
     """A simplification of a generated scene.
 
-    Attributes:
-        preset: The preset.
-        kind: Kind of the scene.
-        count: Number of Gaussians.
-        sh_degree: Degree of the scene.
-        rho: Ratio of Gaussians to keep.
-        views: Number of images, instead of those of the preset, if it uses images.
-        size: Side of the images, pixels.
-        steps: Number of steps of refinement.
+    If the preset uses images, there are ``views`` of ``size`` x ``size`` pixels, and ``steps`` of
+    refinement.
     """
 
     preset: str
@@ -299,9 +293,8 @@ def calibrate(
     open, those of ``prior`` hold; None is the shipped model. A trial that the prior has measured,
     too, tells only how much faster or slower this machine is.
     """
-    kinds = {trial: (trial.kind, trial.count, trial.sh_degree) for trial in trials}
-    made = {key: make(key[0], key[1], sh_degree=key[2]) for key in dict.fromkeys(kinds.values())}
-    scenes = [made[kinds[trial]] for trial in trials]
+    made = cache(make)
+    scenes = [made(trial.kind, trial.count, sh_degree=trial.sh_degree) for trial in trials]
     total, begun = MOST_REPEATS * len(trials), cpu()
 
     def measure(row: int, done: int, text: str) -> Mapping[str, float]:
@@ -343,10 +336,7 @@ def calibrate(
         for with_images, row in first.items()
     }
     model = CostModel.fit(
-        measured,
-        prior=prior,
-        start=starts.get(False, 0.0),
-        image_start=starts.get(True, 0.0),
+        measured, prior=prior, start=starts.get(False, 0.0), image_start=starts.get(True, 0.0)
     )
     return model.model_copy(update={"trials": taken})
 

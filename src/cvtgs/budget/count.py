@@ -81,12 +81,7 @@ class Found(NamedTuple):
 
 
 class Target(NamedTuple):
-    """The quality to reach.
-
-    Attributes:
-        metric: ``psnr`` or ``ssim``.
-        value: dB or similarity.
-    """
+    """The quality to reach: dB or similarity."""
 
     metric: Literal["psnr", "ssim"]
     value: float

@@ -35,11 +35,7 @@ def say(text: str, *, file: TextIO | None = None, end: str = "\n", flush: bool =
 
 def flush_output() -> None:
     """Flush stdout."""
-    file = sys.stdout
-    if file is None:
-        return
-    with _console_errors(file):
-        file.flush()
+    say("", end="", flush=True)
 
 
 def send_file(path: Path) -> None:

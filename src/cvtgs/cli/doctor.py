@@ -3,7 +3,6 @@
 import argparse
 import platform
 import time
-from collections.abc import Sequence
 from importlib import metadata
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NoReturn, cast
@@ -35,16 +34,10 @@ COUNT, RHO, SIDE = 20_000, 0.1, 256
 class ShowVersions(argparse.Action):
     """Print the versions and exit, without loading any of the packages."""
 
-    def __init__(self, option_strings: Sequence[str], dest: str, **settings: Any) -> None:
-        super().__init__(option_strings, dest, nargs=0, **settings)
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(nargs=0, **settings)
 
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: object,
-        option_string: str | None = None,
-    ) -> NoReturn:
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> NoReturn:
         """Print the versions and exit."""
         say("\n".join(version_lines()))
         parser.exit()

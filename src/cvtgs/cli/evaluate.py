@@ -18,12 +18,7 @@ from cvtgs.cli.cameras import (
 )
 from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
 from cvtgs.cli.jobs import expanded
-from cvtgs.cli.options import (
-    AddParser,
-    add_options,
-    read_ratios,
-    read_words,
-)
+from cvtgs.cli.options import AddParser, add_options, read_ratios, read_words
 from cvtgs.cli.view import PAGE, check_page, write_page
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import windows_fault

@@ -40,13 +40,7 @@ _OTHER_FORMATS = "save a scene in another format as a file, whose suffix gives t
 
 
 class Outcome(NamedTuple):
-    """The result of a command for one scene.
-
-    Attributes:
-        counts: Numbers of Gaussians, for example ``500 -> 50 Gaussians``.
-        seconds: The duration as text; empty if it is not printed.
-        notes: Further sentences to print.
-    """
+    """The result of a command for one scene, as texts such as ``500 -> 50 Gaussians``."""
 
     counts: str
     seconds: str = ""
@@ -55,17 +49,11 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneJob:
-    """One scene to read, and the file to write.
-
-    Attributes:
-        options: The options of the command, with ``input`` and ``output`` of this scene.
-        is_one_of_many: Whether the command writes to a directory (``-o DIR``).
-        to_stream: Whether the output is copied to standard output.
-    """
+    """The options of a command, with ``input`` and ``output`` of one scene."""
 
     options: argparse.Namespace
-    is_one_of_many: bool = False
-    to_stream: bool = False
+    is_one_of_many: bool = False  # the command writes to a directory (-o DIR)
+    to_stream: bool = False  # the output is copied to standard output
 
 
 def add_paths(parser: CommandParser, *, options: str) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn, TextIO
+from typing import NoReturn
 
 from cvtgs.cli.completion import add_completion
 from cvtgs.cli.demo import add_demo
@@ -32,9 +32,6 @@ from cvtgs.startup import load_torch
 
 WRITE_SEVERAL = ("levels", "render", "compare", "tradeoff", "demo", "train")
 """Commands that write several files to one folder, which only one run at a time may do."""
-
-WITHOUT_TORCH = ("completion",)
-"""Commands that need no tensors, and start faster without them."""
 
 INTERRUPTED, TERMINATED, PIPE_CLOSED = 130, 143, 141
 BLOCKS_ADVICE = "process a binary .ply in blocks with --memory AMOUNT, for example 2GB"
@@ -86,7 +83,7 @@ def _run(words: Sequence[str]) -> None:
     except SystemExit:  # after --help and --version, whose text may still be in a buffer
         flush_output()
         raise
-    if options.command not in WITHOUT_TORCH:
+    if options.command != "completion":  # needs no tensors, and starts faster without them
         load_torch()
     otherwise = BLOCKS_ADVICE if hasattr(options, "memory") else "ask for less"
     advice = f"free some, or {otherwise}, and use --device cpu if a GPU ran out"
@@ -222,12 +219,5 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _show_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     say(f"cvtgs: warning: {message}", file=sys.stderr)

@@ -291,7 +291,6 @@ def comparison_page(
         name: (parts / f"page.{name}").read_text(encoding="utf-8").strip()
         for name in ("html", "css", "js")
     }
-    page = ""
     for quality, factor in _TRIES:
         page = render_template(
             texts["html"],

@@ -295,11 +295,10 @@ def _find(folder: Path, name: str) -> Path | None:
         exact = folder / inner
         if exact.suffix.lower() in SUFFIXES and exact.is_file():
             return exact
-        bases = [exact.with_suffix("")] if exact.suffix.lower() in SUFFIXES else [exact]
-        for base in bases:
-            for suffix in SUFFIXES:
-                for written in (suffix, suffix.upper()):
-                    candidate = base.with_name(base.name + written)
-                    if candidate.is_file():
-                        return candidate
+        base = exact.with_suffix("") if exact.suffix.lower() in SUFFIXES else exact
+        for suffix in SUFFIXES:
+            for written in (suffix, suffix.upper()):
+                candidate = base.with_name(base.name + written)
+                if candidate.is_file():
+                    return candidate
     return None

@@ -181,14 +181,7 @@ def _is_color(value: Sequence[float]) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ViewImage:
-    """One image of a scene, without background.
-
-    Attributes:
-        camera: The single camera.
-        rgb: ``(1, h, w, 3)`` colours over black.
-        alpha: ``(1, h, w)`` accumulated alpha.
-        backend: Name of the backend that rendered.
-    """
+    """One image of a scene over black, its accumulated alpha, and the backend that rendered it."""
 
     camera: Cameras
     rgb: Float[Tensor, "1 h w 3"]
@@ -250,19 +243,12 @@ class ImageScores(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Metrics:
-    """The metrics to compute; LPIPS weights are kept, so they are read once.
-
-    Attributes:
-        ssim: Whether to compute SSIM.
-        lpips: Weights of LPIPS; None to omit it.
-        note: Why LPIPS is omitted.
-        most_psnr: Upper limit of PSNR, dB.
-    """
+    """The metrics to compute; LPIPS weights are kept, so they are read once."""
 
     ssim: bool = True
     lpips: LpipsWeights | None = None
-    note: str = NOT_ASKED_FOR
-    most_psnr: float = math.inf
+    note: str = NOT_ASKED_FOR  # why LPIPS is omitted
+    most_psnr: float = math.inf  # upper limit of PSNR, dB
 
     def compare(
         self,

@@ -264,10 +264,9 @@ def fitted_to(tradeoff: Tradeoff) -> str:
 
 def _against_photograph(tradeoff: Tradeoff, name: str) -> Mapping[str, str]:
     """Return the columns of scores against photographs, if there are any."""
-    scores = {scores.name: scores for scores in tradeoff.evaluation.photographs}
-    if name not in scores:
+    found = next((one for one in tradeoff.evaluation.photographs if one.name == name), None)
+    if found is None:
         return {}
-    found = scores[name]
     distance = {} if found.lpips is None else {"photo LPIPS": f"{found.lpips.mean:.4f}"}
     return {
         "photo PSNR, dB": f"{found.psnr.mean:.2f}",

@@ -48,15 +48,7 @@ sys.stdout.write(f"\\n{code} {user} {wall} {peak}\\n")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProcessCost:
-    """The cost and the output of one process.
-
-    Attributes:
-        wall_seconds: Wall-clock time from its start to its end.
-        user_seconds: User CPU time.
-        peak_memory_bytes: Peak resident size; 0 where the system does not report it (Windows).
-        output: Its stdout.
-        errors: Its stderr.
-    """
+    """The cost of one process, its stdout and its stderr; Windows reports no peak memory: 0."""
 
     wall_seconds: float
     user_seconds: float
@@ -67,12 +59,7 @@ class ProcessCost:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """A preset and a ratio to run.
-
-    Attributes:
-        preset: Name of the preset.
-        rho: Ratio to keep.
-    """
+    """A preset and a ratio to run."""
 
     preset: str
     rho: float
@@ -90,14 +77,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """A finished run.
-
-    Attributes:
-        task: Its preset and ratio.
-        path: The output file.
-        cost: The cost of its process.
-        report: The report of the simplification.
-    """
+    """A finished run: its output file, the cost of its process, and the report."""
 
     task: Task
     path: Path

@@ -150,13 +150,12 @@ def _three(point: torch.Tensor) -> Point:
 
 
 def start_server(host: str, port: int) -> "viser.ViserServer":
-    module = _viser()
+    check_viewer()
+    import viser  # noqa: PLC0415 (optional)
+
     _check_host(host)  # viser would wait for ever
     with redirect_stdout(io.StringIO()):  # viser prints even if verbose is False
-        server: viser.ViserServer = module.ViserServer(
-            host=host, port=port, label="cvtgs", verbose=False
-        )
-    return server
+        return viser.ViserServer(host=host, port=port, label="cvtgs", verbose=False)
 
 
 def _check_host(host: str) -> None:
@@ -183,17 +182,12 @@ def check_viewer() -> None:
     Raises:
         MissingDependencyError: viser is not installed.
     """
-    _viser()
-
-
-def _viser() -> Any:
     try:
-        import viser  # noqa: PLC0415 (optional)
+        import viser  # noqa: F401, PLC0415 (optional)
     except ImportError as error:
         raise MissingDependencyError(
             f"the viewer needs the package viser; {how_to_install('cvtgs[view]')}."
         ) from error
-    return viser
 
 
 class ViewerServer:
