@@ -4,6 +4,7 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 from cvtgs.errors import InvalidArgumentError, MissingDependencyError, how_to_install
@@ -124,9 +125,7 @@ def _styles(panels: Sequence[Panel]) -> dict[str, dict[str, str]]:
         raise InvalidArgumentError(f"a chart shows at most {most} names, found {len(names)}.")
     styles = [
         {"color": color, "linestyle": style, "marker": marker}
-        for marker in MARKERS
-        for style in STYLES
-        for color in COLORS
+        for marker, style, color in product(MARKERS, STYLES, COLORS)
     ]
     return dict(zip(names, styles, strict=False))
 

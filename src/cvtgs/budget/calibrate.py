@@ -19,7 +19,7 @@ import torch
 import cvtgs
 from cvtgs.budget.costs import FEATURES, CostModel, Measurement, Work
 from cvtgs.clock import StageCost
-from cvtgs.config import PRESETS, Section, SimplifyConfig
+from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.counts import target_count
 from cvtgs.devices import chosen_device, device_name
@@ -97,13 +97,9 @@ class Trial:
         config = SimplifyConfig.from_preset(self.preset)
         if not config.uses_images:
             return config
-        images: dict[str, Section] = {
-            "visibility": config.visibility.model_copy(
-                update={"views": self.views, "size": self.size}
-            ),
-            "refine": config.refine.model_copy(update={"size": self.size, "steps": self.steps}),
-        }
-        return config.model_copy(update=images)
+        visibility = config.visibility.model_copy(update={"views": self.views, "size": self.size})
+        refine = config.refine.model_copy(update={"size": self.size, "steps": self.steps})
+        return config.model_copy(update={"visibility": visibility, "refine": refine})
 
 
 TRIALS = (

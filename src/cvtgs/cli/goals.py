@@ -5,7 +5,7 @@ import math
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, NamedTuple
@@ -152,6 +152,16 @@ def search_target(
 ) -> "Found":
     """Search for the smallest scene whose file, with the given axes, reaches the quality."""
     is_rounded = rounds(options.output)
+
+    def read_back(small: "GaussianScene") -> "GaussianScene":
+        """Write a scene to a temporary file of the format of OUT, and read it again."""
+        with TemporaryDirectory() as folder:
+            file = Path(folder) / options.output.name
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DroppedDataWarning)  # the output file warns
+                cvtgs.io.save(small, file, axes=axes)
+            return cvtgs.io.load(file, device=small.device, axes=axes, trust_sizes=True)
+
     try:
         return cvtgs.budget.find_count(
             scene,
@@ -160,7 +170,7 @@ def search_target(
             simplifier=simplifier,
             cameras=cameras,
             heldout=None if simplifier.config.uses_images else cameras,
-            written=read_back(options.output, axes=axes) if is_rounded else lambda small: small,
+            written=read_back if is_rounded else lambda small: small,
             listener=listener,
         )
     except GoalError as error:
@@ -179,17 +189,3 @@ def rounds(path: Path) -> bool:
 
     limited = tuple(suffix for suffix in READABLE_SUFFIXES if suffix in FORMAT_LIMITS)
     return path.name.lower().endswith(limited)
-
-
-def read_back(path: Path, *, axes: str | None = None) -> "Callable[[GaussianScene], GaussianScene]":
-    """Return a function that writes a scene to a temporary file of this name and reads it again."""
-
-    def read(scene: "GaussianScene") -> "GaussianScene":
-        with TemporaryDirectory() as folder:
-            file = Path(folder) / path.name
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DroppedDataWarning)  # the output file warns
-                cvtgs.io.save(scene, file, axes=axes)
-            return cvtgs.io.load(file, device=scene.device, axes=axes, trust_sizes=True)
-
-    return read

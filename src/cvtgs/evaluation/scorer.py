@@ -327,7 +327,7 @@ class Scorer:
         self._truths: list[tuple[Cameras, _OverBackgrounds]] = []
         for camera in cameras:
             progress(len(self._truths))
-            self._truths.append((camera, self._render(full, camera)))
+            self._truths.append((camera, self._composite(render_view(full, camera))))
         self._truths += [(image.camera, self._composite(image)) for image in images]
         progress(len(self._truths))
 
@@ -338,16 +338,13 @@ class Scorer:
         """Score a scene, view by view and over every background."""
         scores = []
         for camera, truths in self._truths:
-            images = self._render(scene, camera)
+            images = self._composite(render_view(scene, camera))
             alphas = (images.alpha, truths.alpha.to(images.alpha))
             scores += [
                 self._metrics.compare(image, truth, alphas=alphas)
                 for image, truth in zip(images.colors, truths.colors, strict=True)
             ]
         return scores
-
-    def _render(self, scene: GaussianScene, camera: Cameras) -> "_OverBackgrounds":
-        return self._composite(render_view(scene, camera))
 
     def _composite(self, image: ViewImage) -> "_OverBackgrounds":
         colors = [image.over(background).clamp(0, 1) for background in self._backgrounds]

@@ -76,13 +76,11 @@ def scene_page(scenes: Mapping[str, GaussianScene]) -> str:
     server = start_server("127.0.0.1", _ANY_PORT)
     try:
         place = look_at(server, next(iter(scenes.values())))
-        nodes = {
-            name: SceneNode(server, name, f"/scene {k}", label=place)
-            for k, name in enumerate(scenes)
-        }
-        for name, scene in scenes.items():
-            nodes[name].draw(scene, visible=False)
-        return record_page(server, list(nodes.values()))
+        nodes = []
+        for number, (name, scene) in enumerate(scenes.items()):
+            nodes.append(SceneNode(server, name, f"/scene {number}", label=place))
+            nodes[-1].draw(scene, visible=False)
+        return record_page(server, nodes)
     finally:
         stop_server(server)
 
