@@ -121,6 +121,12 @@ def chunk_length(length: int, device: torch.device) -> int:
     return max(1, min(LONGER_CHUNKS, memory // CHUNK_BYTES)) * length
 
 
+def row_chunks(total: int, length: int, device: torch.device) -> list[slice]:
+    """Return consecutive ranges of rows; ``length`` is that on a CPU (:func:`chunk_length`)."""
+    step = chunk_length(length, device)
+    return [slice(start, min(start + step, total)) for start in range(0, total, step)]
+
+
 def within_memory(
     compute: Callable[[torch.device, str], Result],
     device: torch.device,
@@ -176,7 +182,10 @@ def in_threads(
     the same bits, whatever the number of threads. On other devices than CPUs, chunks run
     sequentially. Results come in the order of the items, computed when requested or earlier.
     """
-    threads = _threads_of_torch()
+    with _Limits.lock:
+        threads = torch.get_num_threads()
+        if threads == 1 and _Limits.running > 0 and not _OWN.is_limited:
+            threads = _Limits.threads  # another call limits torch at the moment
     if device.type != "cpu" or threads == 1 or thread_count() == 1:
         return map(function, items)
     return _in_pool(function, items, min(threads, thread_count()))
@@ -189,9 +198,7 @@ def in_chunks(
 
     ``length`` is that on a CPU. Without rows, there is one empty range.
     """
-    step = chunk_length(length, device)
-    starts = range(0, max(1, total), step)
-    parts = [slice(start, min(start + step, total)) for start in starts]
+    parts = row_chunks(total, length, device) or [slice(0, 0)]
     return list(in_threads(function, parts, device))
 
 
@@ -220,13 +227,6 @@ def _in_pool(
         finally:
             for future in waiting:
                 future.cancel()
-
-
-def _threads_of_torch() -> int:
-    """Return torch's number of threads, even where another call limits it at the moment."""
-    with _Limits.lock:
-        own = torch.get_num_threads()
-        return own if own > 1 or _Limits.running == 0 or _OWN.is_limited else _Limits.threads
 
 
 def _limit_own(before: int) -> None:

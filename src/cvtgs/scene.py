@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.counts import whole_number
-from cvtgs.devices import chunk_length, usable_device
+from cvtgs.devices import row_chunks, usable_device
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.selection import row_numbers
@@ -78,7 +78,8 @@ class GaussianScene:
 
     def __post_init__(self) -> None:
         """Check that shapes, dtypes and devices fit together."""
-        for name, tensor in self.tensors().items():
+        tensors = self.tensors()
+        for name, tensor in tensors.items():
             if not isinstance(tensor, Tensor):
                 raise InvalidSceneError(
                     f"{name} must be a torch.Tensor, found {type(tensor).__name__}; "
@@ -90,7 +91,7 @@ class GaussianScene:
             raise InvalidSceneError(f"means must be float32 or float64, found {dtype}.")
         bands = self.shN.shape[1] if self.shN.ndim == 3 else 0
         shapes = (n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, bands, 3)
-        for (name, tensor), shape in zip(self.tensors().items(), shapes, strict=True):
+        for (name, tensor), shape in zip(tensors.items(), shapes, strict=True):
             if tuple(tensor.shape) != shape:
                 sizes = (n, "k", 3) if name == "shN" else shape
                 raise InvalidSceneError(
@@ -136,15 +137,14 @@ class GaussianScene:
     def areas(self) -> Float[Tensor, "n"]:
         """Mean projected areas of the one-sigma ellipsoids, squared scene units, float64."""
         areas = self.log_scales.new_empty(len(self.means), dtype=torch.float64)
-        length = chunk_length(_CHUNK, self.device)
-        for part, found in zip(self.log_scales.split(length), areas.split(length), strict=True):
-            found[:] = parameters.mean_projected_area(torch.exp(part.double()))
+        for part in row_chunks(len(areas), _CHUNK, areas.device):
+            areas[part] = parameters.mean_projected_area(torch.exp(self.log_scales[part].double()))
         return areas
 
     @property
     def masses(self) -> Float[Tensor, "n"]:
         """Opacity times mean projected area, squared scene units, float64."""
-        return self.areas.mul_(parameters.opacity_from_logit(self.logit_opacities))
+        return self.areas.mul_(self.opacities)
 
     @property
     def sh(self) -> Float[Tensor, "n k_plus_1 3"]:

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.devices import chunk_length
+from cvtgs.devices import row_chunks
 from cvtgs.math.frames import RobustFrame
 
 VOXEL = 0.04
@@ -94,9 +94,7 @@ def add_depths(
         [1.0]
     """
     voxels = torch.empty(len(means), dtype=torch.int32, device=means.device)
-    chunk = chunk_length(CHUNK, means.device)
-    for start in range(0, len(means), chunk):
-        part = slice(start, start + chunk)
+    for part in row_chunks(len(means), CHUNK, means.device):
         voxel, shrinkage = _voxels_of(means[part], frame)
         voxels[part] = voxel.to(torch.int32)
         depths = masses[part] * (shrinkage / (frame.radius * VOXEL)).square()
@@ -151,8 +149,8 @@ def visibility_at(
         >>> visibility_at(grid, torch.zeros(1, 3), frame).tolist()
         [1.0]
     """
-    chunks = means.split(chunk_length(CHUNK, means.device))
-    parts = [grid[_voxels_of(part, frame)[0]] for part in chunks]
+    chunks = row_chunks(len(means), CHUNK, means.device)
+    parts = [grid[_voxels_of(means[part], frame)[0]] for part in chunks]
     return torch.cat([grid[:0], *parts]).double()
 
 

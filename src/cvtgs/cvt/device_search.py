@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.cvt.leaves import FAN_BITS, Boxes, Leaves, boxes_of, home_leaves, split_sites
-from cvtgs.devices import chunk_length
+from cvtgs.devices import chunk_length, row_chunks
 
 LEAF = 16
 """Largest number of sites in a leaf, unless more are wanted for each point."""
@@ -107,10 +107,9 @@ def nearest_in_tiles(
     leaves = split_sites(sites, max(LEAF, 4 * count))  # at least twice as many as wanted
     homes, order = torch.sort(home_leaves(points, leaves.splits), stable=True)
     boxes = boxes_of(leaves.sites)
-    step = chunk_length(TILES, points.device) * TILE
     with _full_float32():
-        for start in range(0, len(points), step):
-            rows, own = order[start : start + step], homes[start : start + step]
+        for part in row_chunks(len(points), TILES * TILE, points.device):
+            rows, own = order[part], homes[part]
             found[rows], squared[rows] = _nearest_of_part(points[rows], own, leaves, boxes, count)
     if count > 1:
         squared, ranks = torch.sort(squared, dim=1, stable=True)

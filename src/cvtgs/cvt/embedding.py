@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.devices import chunk_length
+from cvtgs.devices import row_chunks
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import SH_C0
 
@@ -46,9 +46,7 @@ def embed(
     """
     colored = sh0 is not None and color > 0.0
     points = means.new_empty(len(means), 6 if colored else 3)
-    chunk = chunk_length(CHUNK, means.device)
-    for start in range(0, len(means), chunk):
-        part = slice(start, start + chunk)
+    for part in row_chunks(len(means), CHUNK, means.device):
         local = means[part]
         position = frame.contract(local, contraction) if contraction else frame.normalize(local)
         points[part, :3] = position.clamp_(-FARTHEST, FARTHEST)
@@ -83,11 +81,7 @@ def gaussian_weights(
 
 
 def tessellation_weights(
-    opacities: Float[Tensor, "n"],
-    areas: Float[Tensor, "n"],
-    *,
-    area_power: float,
-    floor: float,
+    opacities: Float[Tensor, "n"], areas: Float[Tensor, "n"], *, area_power: float, floor: float
 ) -> Float[Tensor, "n"]:
     """Return the weight of every Gaussian.
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.devices import chunk_length
+from cvtgs.devices import row_chunks
 
 RADIUS_QUANTILE = 0.7
 """The share of points within the radius of a frame."""
@@ -60,10 +60,8 @@ class RobustFrame:
             Distances in float64.
         """
         found = torch.empty(len(points), dtype=torch.float64, device=points.device)
-        length = chunk_length(CHUNK, points.device)
-        for start in range(0, len(points), length):
-            local = self.normalize(points[start : start + length])
-            found[start : start + length] = torch.linalg.vector_norm(local, dim=1)
+        for part in row_chunks(len(points), CHUNK, points.device):
+            found[part] = torch.linalg.vector_norm(self.normalize(points[part]), dim=1)
         return found
 
     def contract(self, points: Float[Tensor, "n 3"], strength: float = 1.0) -> Float[Tensor, "n 3"]:
