@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
-from cvtgs.devices import chunk_length
+from cvtgs.devices import chunk_length, row_chunks
 from cvtgs.math.parameters import MIN_ALPHA, divide, opacity_from_logit
 from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
 from cvtgs.scene import GaussianScene
@@ -140,28 +140,21 @@ def plan_effects(
         duplicate_share(scene.means, scene.sh0),
     ]
     far, hazy, duplicates = torch.stack(shares).tolist()  # one synchronization with the device
-    antialiased, two_scales = scene.antialiased, scene.has_two_scales
     above = (far - UNBOUNDED_SHARE) / (FULLY_UNBOUNDED_SHARE - UNBOUNDED_SHARE)
     beyond = f"of the mass is beyond {UNBOUNDED_DISTANCE:g} robust radii"
     unbounded = _by_share(far, choices.unbounded, UNBOUNDED_SHARE, beyond)
     return EffectPlan(
         sh=_plan_bands(scene, choices.sh),
-        mip=Effect(
-            active=antialiased and choices.mip != "off",
-            figure=float(antialiased),
-            meaning="on if the comment SplatRenderMode: mip is present (1)",
-            forced=choices.mip != "auto",
+        mip=_if_present(
+            scene.antialiased, choices.mip, "the comment SplatRenderMode: mip is present (1)"
         ),
         unbounded=GradedEffect(
             **unbounded.model_dump(),
             strength=min(1.0, max(0.0, above)) if unbounded.active else 0.0,
         ),
         haze=plan_haze(hazy, config),
-        flat=Effect(
-            active=two_scales and choices.flat != "off",
-            figure=float(two_scales),
-            meaning="on if the file has two scales per Gaussian (1)",
-            forced=choices.flat != "auto",
+        flat=_if_present(
+            scene.has_two_scales, choices.flat, "the file has two scales per Gaussian (1)"
         ),
         duplicates=_by_share(
             duplicates,
@@ -169,17 +162,11 @@ def plan_effects(
             DUPLICATE_SHARE,
             "of the Gaussians coincide with others of the same colour",
         ),
-        extras=Effect(
-            active=bool(scene.extras),
-            figure=len(scene.extras),
-            meaning="on if there are columns beyond the standard ones",
-            forced=choices.extras != "auto",
+        extras=_if_present(
+            len(scene.extras), choices.extras, "there are columns beyond the standard ones"
         ),
-        visibility=Effect(
-            active=config.uses_renders,
-            figure=config.visibility.views,
-            meaning="on if the preset asks for images",
-            forced=choices.visibility != "auto",
+        visibility=_if_present(
+            config.visibility.views, choices.visibility, "the preset asks for images"
         ),
     )
 
@@ -262,6 +249,16 @@ def _by_share(share: float, choice: str, least: float, what: str) -> Effect:
         active=share > (least if choice == "auto" else 0.0) and choice != "off",
         figure=share,
         meaning=f"on if more than {least:g} {what}",
+        forced=choice != "auto",
+    )
+
+
+def _if_present(figure: float, choice: str, what: str) -> Effect:
+    """Decide on an effect: on where there is something to compute, unless it is switched off."""
+    return Effect(
+        active=figure > 0 and choice != "off",
+        figure=figure,
+        meaning=f"on if {what}",
         forced=choice != "auto",
     )
 
@@ -351,11 +348,10 @@ def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) ->
     """
     bits = max(0, math.floor(math.log2(max(1, len(means)) / HASHED)))
     rows, hashes = [], []
-    chunk = chunk_length(CHUNK << 2, means.device)
-    for start in range(0, len(means), chunk):
-        keys = _hash(means[start : start + chunk])
+    for part in row_chunks(len(means), CHUNK << 2, means.device):
+        keys = _hash(means[part])
         chosen = (keys & ((1 << bits) - 1) == 0).nonzero()[:, 0]
-        rows.append(chosen + start)
+        rows.append(chosen + part.start)
         hashes.append(keys[chosen])
     sample = torch.cat(rows)
     sample = sample[torch.sort(torch.cat(hashes), stable=True).indices]
