@@ -60,10 +60,10 @@ def test_a_cell_changes_its_own_crop_only():
     merged = case.reference.merged.select(case.cells[:9])
     larger = merged.logit_opacities.clone()
     larger[4] = 6.0
-    grid = grid_of(case, count=9, changes={"logit_opacities": larger})
+    grids = (grid_of(case, count=9), grid_of(case, count=9, changes={"logit_opacities": larger}))
     before, after = (
-        cut_crops(render(scene, grid.camera, background=torch.zeros(3)).rgb, 9, TILE, 2)
-        for scene in (grid.merged, grid.corrected)
+        cut_crops(render(grid.corrected, grid.camera, background=torch.zeros(3)).rgb, 9, TILE, 2)
+        for grid in grids
     )
     changed = (before != after).flatten(1).any(dim=1)
     assert changed.nonzero()[:, 0].tolist() == [4]
@@ -83,13 +83,16 @@ def test_colours_use_all_bands_in_the_direction_of_the_camera():
     assert merged.shN.shape[1] == 3
     grid = grid_of(case, count=4)
     turns = parameters.multiply_quats(
-        grid.merged.quats, parameters.normalize_quats(merged.quats) * torch.tensor([1, -1, -1, -1])
+        grid.corrected.quats,
+        parameters.normalize_quats(merged.quats) * torch.tensor([1, -1, -1, -1]),
     )
     forward = parameters.quats_to_matrices(turns).mT @ torch.tensor([0.0, 0.0, 1.0])
     wanted = spherical_harmonics.evaluate(merged.sh0, merged.shN, forward)
-    found = 0.5 + spherical_harmonics.SH_C0 * grid.merged.sh0[:, 0]
+    found = 0.5 + spherical_harmonics.SH_C0 * grid.corrected.sh0[:, 0]
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5)
-    assert not torch.allclose(grid.merged.sh0, grid_of(case, count=4, all_bands=False).merged.sh0)
+    assert not torch.allclose(
+        grid.corrected.sh0, grid_of(case, count=4, all_bands=False).corrected.sh0
+    )
 
 
 def test_the_loss_is_the_published_one_without_a_logarithm():
@@ -111,7 +114,7 @@ def test_the_loss_is_the_published_one_without_a_logarithm():
     )
     image, target = (
         cut_crops(render(scene, grid.camera, background=background).rgb, 4, TILE, 2)
-        for scene in (grid.merged, grid.members)
+        for scene in (grid.corrected, grid.members)
     )
     assert found == pytest.approx(image_loss(image, target).item(), rel=1e-5)
 

@@ -105,9 +105,18 @@ def _packed_views(all_views: Iterable[TargetViews]) -> dict[str, Tensor]:
 
 
 def _unpacked_views(tensors: Mapping[str, Tensor]) -> tuple[TargetViews, ...]:
-    return tuple(
-        _views(under_prefix(f"{number}/", tensors)) for number in range(_entry_count(tensors))
-    )
+    found = []
+    for entry in _entries(tensors):
+        rgb = entry["rgb"]
+        cameras = Cameras(
+            viewmats=entry["viewmats"],
+            Ks=entry["Ks"],
+            width=rgb.shape[2],
+            height=rgb.shape[1],
+            ignores_tag=tuple(entry["ignores_tag"].tolist()),
+        )
+        found.append(TargetViews(cameras=cameras, rgb=rgb, alpha=entry["alpha"]))
+    return tuple(found)
 
 
 def _packed_cases(cases: Iterable[Case | None]) -> dict[str, Tensor]:
@@ -136,54 +145,35 @@ def _packed_cases(cases: Iterable[Case | None]) -> dict[str, Tensor]:
 
 
 def _unpacked_cases(name: str, tensors: Mapping[str, Tensor]) -> tuple[Case, ...]:
-    count = _entry_count(tensors)
-    if count == 0:
+    entries = _entries(tensors)
+    if not entries:
         return ()
     # Merged Gaussians must be rendered in the same way as their scene.
     comments = (ANTIALIASED_TAG,) if "antialiased" in tensors else ()
     scene = GaussianScene(**under_prefix("scene/", tensors), comments=comments)
-    shared = tensors["visibility"], float(tensors["radius"])
-    return tuple(
-        _case(name, scene, *shared, under_prefix(f"{number}/", tensors)) for number in range(count)
-    )
-
-
-def _entry_count(tensors: Mapping[str, Tensor]) -> int:
-    """Count the numbered entries."""
-    return len({name.split("/")[0] for name in tensors if name.split("/")[0].isdecimal()})
-
-
-def _case(
-    name: str,
-    scene: GaussianScene,
-    visibility: Tensor,
-    radius: float,
-    tensors: Mapping[str, Tensor],
-) -> Case:
-    partition = Partition(order=tensors["order"], offsets=tensors["offsets"])
-    return Case(
-        scene_name=name,
-        ratio=float(tensors["ratio"]),
-        reference=MergedScene(
+    found = []
+    for entry in entries:
+        partition = Partition(order=entry["order"], offsets=entry["offsets"])
+        reference = MergedScene(
             scene=scene,
-            merged=GaussianScene(**under_prefix("merged/", tensors), comments=scene.comments),
+            merged=GaussianScene(**under_prefix("merged/", entry), comments=comments),
             partition=partition,
-            neighbors=tensors["neighbors"],
-            visibility=visibility,
-            radius=radius,
-        ),
-        cells=partition.several(),
-        descriptors=Descriptors(**under_prefix("seen/", tensors)),
-    )
+            neighbors=entry["neighbors"],
+            visibility=tensors["visibility"],
+            radius=float(tensors["radius"]),
+        )
+        case = Case(
+            scene_name=name,
+            ratio=float(entry["ratio"]),
+            reference=reference,
+            cells=partition.several(),
+            descriptors=Descriptors(**under_prefix("seen/", entry)),
+        )
+        found.append(case)
+    return tuple(found)
 
 
-def _views(tensors: Mapping[str, Tensor]) -> TargetViews:
-    rgb = tensors["rgb"]
-    cameras = Cameras(
-        viewmats=tensors["viewmats"],
-        Ks=tensors["Ks"],
-        width=rgb.shape[2],
-        height=rgb.shape[1],
-        ignores_tag=tuple(tensors["ignores_tag"].tolist()),
-    )
-    return TargetViews(cameras=cameras, rgb=rgb, alpha=tensors["alpha"])
+def _entries(tensors: Mapping[str, Tensor]) -> list[dict[str, Tensor]]:
+    """Return the tensors of the numbered entries."""
+    count = len({name.split("/")[0] for name in tensors if name.split("/")[0].isdecimal()})
+    return [under_prefix(f"{number}/", tensors) for number in range(count)]

@@ -18,14 +18,7 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.filters import filter_rows
 from cvtgs.grouping import allocate, collect_cells, tessellate_rows, weigh_rows
 from cvtgs.io import load_cameras
-from cvtgs.mergenet import (
-    MergeNet,
-    Net,
-    Residuals,
-    compose,
-    compose_published,
-    describe_published,
-)
+from cvtgs.mergenet import MergeNet, Net, Residuals, compose, compose_published, describe_published
 from cvtgs.pipeline import merge_and_inflate
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
@@ -112,11 +105,7 @@ class Case:
 
     def select(self, rows: Int[Tensor, "s"]) -> "Case":
         """Return the case restricted to some of its cells."""
-        return replace(
-            self,
-            cells=self.cells[rows],
-            descriptors=self.descriptors.select(rows),
-        )
+        return replace(self, cells=self.cells[rows], descriptors=self.descriptors.select(rows))
 
     def seen_by(self, cameras: Cameras) -> "Case":
         """Return the case with descriptors for the image size of some cameras."""

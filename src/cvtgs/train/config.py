@@ -153,7 +153,7 @@ class TrainConfig(Section):
     loss: LossConfig = LossConfig()
 
     @pydantic.model_validator(mode="after")
-    def _check_loss(self) -> Self:
+    def _check(self) -> Self:
         loss = self.loss
         weights = (loss.mse_weight, loss.image_weight, loss.ssim_weight)
         if self.kind != "published" and not any(weights):
@@ -161,10 +161,6 @@ class TrainConfig(Section):
                 "loss: one of mse_weight, image_weight and ssim_weight must be above 0, found 0 "
                 "for all."
             )
-        return self
-
-    @pydantic.model_validator(mode="after")
-    def _check_restart(self) -> Self:
         if self.restart_step >= self.steps:
             raise ConfigError(
                 f"restart_step must be below the {self.steps} steps, found {self.restart_step}."

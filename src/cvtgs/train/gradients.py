@@ -103,23 +103,14 @@ def _case_gradient(
 ) -> CaseGradient:
     rng = random.Random(f"{config.seed}/{step}/{number}" if number else f"{config.seed}/{step}")
     case, views = rng.choice(cases)
-    loss = _loss(net, case, views, config, rng, copies)
-    gradients = torch.autograd.grad(loss, list(net.parameters()), materialize_grads=True)
-    return CaseGradient(case.name, float(loss.detach()), list(gradients))
-
-
-def _loss(
-    net: Net,
-    case: Case,
-    views: Sequence[TargetViews],
-    config: TrainConfig,
-    rng: random.Random,
-    copies: DeviceCopies,
-) -> Tensor:
     case = copies.get(case)
     if isinstance(net, PublishedMergeNet):
-        return published_loss(net, case, config=config, rng=rng)
-    some_views = rng.choice(views)
-    if config.kind == "local":
-        return local_loss(net, case, config=config, rng=rng)
-    return scene_loss(net, case, copies.get(some_views), config=config, rng=rng)
+        loss = published_loss(net, case, config=config, rng=rng)
+    else:
+        some_views = rng.choice(views)
+        if config.kind == "local":
+            loss = local_loss(net, case, config=config, rng=rng)
+        else:
+            loss = scene_loss(net, case, copies.get(some_views), config=config, rng=rng)
+    gradients = torch.autograd.grad(loss, list(net.parameters()), materialize_grads=True)
+    return CaseGradient(case.name, float(loss.detach()), list(gradients))

@@ -295,14 +295,9 @@ def _restore_checkpoint(state: TrainState, config: TrainConfig, files: TrainFile
 
 
 def _write_checkpoint(state: TrainState, config: TrainConfig, files: TrainFiles) -> None:
-    with atomic_output(files.checkpoint, overwrite=True) as file:
-        file.write(save_checkpoint(state.mean_net, _description(state, config)))
-
-
-def _description(state: TrainState, config: TrainConfig) -> CheckpointInfo:
     # Without paths, and without the note, which has its own field.
     settings = config.model_dump_json(exclude={"start": True, "note": True, "data": {"folders"}})
-    return CheckpointInfo(
+    info = CheckpointInfo(
         architecture=state.net.architecture,
         preset=config.preset,
         training=config.note or f"{config.kind} training",
@@ -313,3 +308,5 @@ def _description(state: TrainState, config: TrainConfig) -> CheckpointInfo:
         start=state.start,
         scenes=state.scenes,
     )
+    with atomic_output(files.checkpoint, overwrite=True) as file:
+        file.write(save_checkpoint(state.mean_net, info))

@@ -4,7 +4,6 @@ import math
 import random
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -64,8 +63,7 @@ def scene_loss(
     case = case.select(_seen_cells(case, [shot.crop_camera() for shot in shots]))
     case = case.seen_by(views.cameras)
     residuals = _predict(net, case)
-    corrected = case.correct_scene(residuals)
-    losses = []
+    corrected, losses = case.correct_scene(residuals), []
     for shot in shots:
         image = render(corrected, shot.view.cameras, background=shot.background).rgb
         target = shot.view.over(shot.background)
@@ -250,13 +248,11 @@ class CellGrid:
 
     Attributes:
         members: All members.
-        merged: The merged Gaussians.
-        corrected: The corrected ones.
+        corrected: The corrected merged Gaussians.
         camera: Camera that sees all of them.
     """
 
     members: GaussianScene
-    merged: GaussianScene
     corrected: GaussianScene
     camera: Cameras
 
@@ -277,18 +273,15 @@ def lay_out_cells(
     Tiles are ``tile`` pixels wide; their centres are ``apart`` tile widths apart. Colours are those
     of the constant band, or of all bands as seen by the camera.
     """
-    count = len(cells)
-    side = math.ceil(math.sqrt(count))
+    side = math.ceil(math.sqrt(len(cells)))
     merged = reference.merged.select(cells)
     placement = _Placement.draw(merged, side, rng, apart)
     ids = segment_ids(part.offsets, len(part.order))
-    members = reference.scene.select(part.order)
-    own = torch.arange(count, device=ids.device)
-    place = partial(placement.apply, all_bands=all_bands)
+    own = torch.arange(len(cells), device=ids.device)
+    members = reference.scene.select(part.order).tensors()
     return CellGrid(
-        members=place(members.tensors(), ids),
-        merged=place(merged.tensors(), own),
-        corrected=place(corrected, own),
+        members=placement.apply(members, ids, all_bands=all_bands),
+        corrected=placement.apply(corrected, own, all_bands=all_bands),
         camera=_grid_camera(side * apart, merged.means, tile),
     )
 

@@ -164,12 +164,7 @@ class History:
 class TrainState:
     """A network in training: its weights, their running mean, the optimiser, the history."""
 
-    def __init__(
-        self,
-        net: Net,
-        config: TrainConfig,
-        scenes: Iterable[LearnedScene] = (),
-    ) -> None:
+    def __init__(self, net: Net, config: TrainConfig, scenes: Iterable[LearnedScene] = ()) -> None:
         self.net = net
         self.mean_net = copy.deepcopy(net).eval().requires_grad_(False)
         self.optimizer = torch.optim.AdamW(
@@ -214,16 +209,20 @@ class TrainState:
         try:
             tensors, metadata = map_tensors(path)
             record = json.loads(metadata["state"])
-            _check_version(path, record["version"])
+            if record["version"] != cvtgs.__version__:  # a checkpoint names one version
+                raise CheckpointError(
+                    f"{path}: the state was written by cvtgs {record['version']}, but this is "
+                    f"{cvtgs.__version__}; remove it, or train to another output."
+                )
             self._check_settings(path, record["config"], config)
             self._check_scenes(path, record["scenes"])
             # Mapped tensors must not be written to, and the optimiser does not copy them: clone.
             self._load_tensors({name: values.clone() for name, values in tensors.items()})
             self.step = int(record["step"])
             self.history = History.from_json(record["history"])
+        except CheckpointError:
+            raise
         except (KeyError, ValueError, TypeError, RuntimeError) as error:
-            if isinstance(error, CheckpointError):
-                raise
             raise CheckpointError(
                 f"{path}: the training state is damaged; remove it, or train to another output."
             ) from error
@@ -267,15 +266,6 @@ class TrainState:
         kept = {number: under_prefix(f"optimizer/{number}/", tensors) for number in range(count)}
         state["state"] = {number: values for number, values in kept.items() if values}
         self.optimizer.load_state_dict(state)
-
-
-def _check_version(path: Path, version: str) -> None:
-    """Raise an error for another version: a checkpoint names one."""
-    if version != cvtgs.__version__:
-        raise CheckpointError(
-            f"{path}: the state was written by cvtgs {version}, but this is {cvtgs.__version__}; "
-            f"remove it, or train to another output."
-        )
 
 
 def _fingerprint(config: TrainConfig, start: str) -> dict[str, Any]:
