@@ -13,13 +13,7 @@ from cvtgs.cells.merge import (
     merged_depth,
     normalized_weights,
 )
-from cvtgs.cells.moments import (
-    Moments,
-    gaussian_moments,
-    group_moments,
-    mass_unit,
-    view_components,
-)
+from cvtgs.cells.moments import Moments, gaussian_moments, group_moments, mass_unit, view_components
 from cvtgs.cells.partition import Partition, SampledMembers, sample_members
 
 __all__ = [

@@ -231,23 +231,21 @@ def _cheapest_disjoint(
     # Bits of positive floats are in the order of the floats, so these keys are in that of costs.
     keys = costs.view(torch.int32).long() << ROW_BITS
     keys |= torch.arange(len(keys), device=keys.device)
-    left, is_free = [first, second], torch.ones(total, dtype=torch.bool, device=keys.device)
+    i, j, is_free = first, second, torch.ones(total, dtype=torch.bool, device=keys.device)
     taken: list[Tensor] = []
     for _ in range(MOST_ROUNDS):
         least = torch.full((total,), torch.iinfo(torch.int64).max, device=keys.device)
-        for groups in left:
-            least.scatter_reduce_(0, groups, keys, "amin")
-        cheapest = [least.index_select(0, groups) == keys for groups in left]
-        chosen = (cheapest[0] & cheapest[1]).nonzero()[:, 0]
+        least.scatter_reduce_(0, i, keys, "amin").scatter_reduce_(0, j, keys, "amin")
+        is_cheapest = (least.index_select(0, i) == keys) & (least.index_select(0, j) == keys)
+        chosen = is_cheapest.nonzero()[:, 0]
         taken.append(keys.index_select(0, chosen))
-        for groups in left:
-            is_free[groups.index_select(0, chosen)] = False
-        free = [is_free.index_select(0, groups) for groups in left]
-        stays = (free[0] & free[1]).nonzero()[:, 0]
-        *left, keys = (values.index_select(0, stays) for values in (*left, keys))
+        is_free[i.index_select(0, chosen)] = False
+        is_free[j.index_select(0, chosen)] = False
+        left = (is_free.index_select(0, i) & is_free.index_select(0, j)).nonzero()[:, 0]
+        i, j, keys = i.index_select(0, left), j.index_select(0, left), keys.index_select(0, left)
         if len(keys) == 0:
             break
-    taken.append(_greedy_pass(left[0], left[1], keys, is_free))
+    taken.append(_greedy_pass(i, j, keys, is_free))
     found = torch.sort(torch.cat(taken)).values
     rows = torch.sort(found[:wanted] & LAST_ROW).values
     return first.index_select(0, rows), second.index_select(0, rows)

@@ -199,7 +199,13 @@ def describe_members(
     masses = torch.exp(log_masses - segment_max(log_masses, offsets).index_select(0, ids))
     weights = masses / _sum(masses, offsets).index_select(0, ids)
     if len(rows) < len(part.order):
-        relative = _center(relative, weights, sampled=sampled, ids=ids)
+        # Estimates that agree with known totals are calibrated (Deville and Sarndal 1992): the mean
+        # of a sample becomes that of all members, the centre of the cell. Otherwise, the chance of
+        # the sample would move, turn and shade the cell.
+        means = _sum(weights[:, None] * relative.positions, offsets)
+        means = torch.where((sampled.counts > offsets.diff())[:, None], means, 0.0)
+        positions = relative.positions - means.index_select(0, ids)
+        relative = relative._replace(positions=positions)
     totals = _total(members, relative, weights, visible, sampled=sampled, ids=ids)
     sides = torch.cat([context.cover_difference.T, totals.visibility_gradients.T])
     sides = sides.index_select(1, ids)
@@ -282,24 +288,6 @@ def _local_positions(rotations: Tensor, log_scales: Tensor, shifts: Tensor) -> T
     turned = project_on_axes(rotations, shifts[:, :, None])[:, :, 0]
     units = torch.exp((-log_scales).clamp(-LARGEST_LOG, LARGEST_LOG))
     return (turned * units).clamp(-LARGEST_POSITION, LARGEST_POSITION)
-
-
-def _center(
-    relative: RelativeGaussians,
-    weights: Float[Tensor, "n"],
-    *,
-    sampled: SampledMembers,
-    ids: Int[Tensor, "n"],
-) -> RelativeGaussians:
-    """Move sampled members so that their mean is that of all members, the centre of the cell.
-
-    Otherwise, the chance of the sample would move, turn and shade the cell. Estimates that agree
-    with known totals are calibrated (Deville and Sarndal 1992).
-    """
-    offsets = sampled.part.offsets
-    means = _sum(weights[:, None] * relative.positions, offsets)
-    means = torch.where((sampled.counts > offsets.diff())[:, None], means, 0.0)
-    return relative._replace(positions=relative.positions - means.index_select(0, ids))
 
 
 def _total(

@@ -64,10 +64,9 @@ def merge_cells(
         >>> len(merge_cells(scene, cells, config=MergeConfig()))
         2
     """
-    counts = partition.counts
     merged = scene.select(partition.order[partition.offsets[:-1]])
     cells, several = partition.select_several()
-    done = len(counts) - len(cells)
+    done = len(partition) - len(cells)
     tensors, extras = merged.tensors(), dict(merged.extras)
     chunk = chunk_length(CHUNK_MEMBERS, scene.means.device)
 
@@ -270,11 +269,7 @@ def merged_depth(
 
 
 def keep_representatives(
-    scene: GaussianScene,
-    merged: GaussianScene,
-    partition: Partition,
-    *,
-    areas: Float[Tensor, "n"],
+    scene: GaussianScene, merged: GaussianScene, partition: Partition, *, areas: Float[Tensor, "n"]
 ) -> tuple[GaussianScene, Partition]:
     """Replace merged Gaussians by a member where members hardly touch, or one is nearly all.
 

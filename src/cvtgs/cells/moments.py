@@ -227,15 +227,8 @@ def view_colors(
     """Return the components of the view-dependent colour of some Gaussians, in units of RGB.
 
     The sum of the squared differences of two Gaussians is at most the squared difference of their
-    view-dependent colours, averaged over all directions.
-
-    Args:
-        scene: The Gaussians; bands beyond those of the components are ignored.
-        rows: Row numbers.
-        components: Result of :func:`view_components`, on the device of the scene.
-
-    Returns:
-        One row per Gaussian, float64.
+    view-dependent colours, averaged over all directions. Bands beyond those of ``components``,
+    which :func:`view_components` returns, are ignored.
     """
     return _project(scene.shN.index_select(0, rows), components)
 

@@ -64,7 +64,7 @@ def ascending_rows(values: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
 
 def gather_columns(
     rows: Int[Tensor, "r"], *tables: Float[Tensor, "n c"]
-) -> tuple[Float[Tensor, "r c"], ...]:
+) -> list[Float[Tensor, "r c"]]:
     """Gather scattered rows of narrow tables.
 
     Args:
@@ -79,7 +79,7 @@ def gather_columns(
         >>> gather_columns(torch.tensor([2, 0]), torch.eye(3))[0].tolist()
         [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
     """
-    return tuple(columns.T for columns in take_columns(rows, *[table.T for table in tables]))
+    return [table.T.gather(1, rows.expand(table.shape[1], -1)).T for table in tables]
 
 
 def take_columns(

@@ -13,12 +13,7 @@ from cvtgs.devices import chunk_length, in_threads
 from cvtgs.math import parameters
 from cvtgs.math.segments import segment_sum, segment_sum_of
 from cvtgs.mergenet.model import MergeNet, Residuals
-from cvtgs.mergenet.published import (
-    Net,
-    PublishedMergeNet,
-    PublishedResiduals,
-    describe_published,
-)
+from cvtgs.mergenet.published import Net, PublishedMergeNet, PublishedResiduals, describe_published
 from cvtgs.scene import GaussianScene
 
 CHUNK_MEMBERS = 1 << 15
@@ -72,10 +67,9 @@ def correct_cells(  # noqa: PLR0913 (options by name)
         >>> bool((corrected.means == merged.means).all())
         True
     """
-    counts = partition.counts
-    sizes = counts if sizes is None else sizes
+    sizes = partition.counts if sizes is None else sizes
     cells, several = partition.select_several()
-    done = len(counts) - len(cells)
+    done = len(partition) - len(cells)
     if len(cells) == 0:
         return merged
     originals = merged.tensors()
@@ -129,7 +123,8 @@ def _correct_gated(  # noqa: PLR0913 (options by name)
     step = max(1, chunk // max(1, near))
 
     def chunks() -> Iterator[tuple[Tensor, NeighborContext, Partition]]:
-        for block in (slice(start, start + step) for start in range(0, len(cells), step)):
+        for start in range(0, len(cells), step):
+            block = slice(start, start + step)
             own = cells[block]
             context = neighbor_context(merged, cells=own, neighbors=neighbors[own], sizes=sizes)
             for run, part in several.cut(block).chunks(chunk, cell_cost=near):
@@ -142,16 +137,14 @@ def _correct_gated(  # noqa: PLR0913 (options by name)
         descriptors = describe_members(
             scene, part, context=context, visibility=visibility, pixel_size=pixel_size
         )
-        residuals = net(descriptors)
-        corrected = compose(
+        return rows, compose(
             scene,
             merged,
             descriptors.part,
             cells=rows,
             neighbors=neighbors[rows],
-            residuals=residuals,
+            residuals=net(descriptors),
         )
-        return rows, corrected
 
     yield from in_threads(correct, chunks(), scene.device)
 
@@ -279,23 +272,18 @@ def _reshape(
     merged: GaussianScene, cells: Int[Tensor, "m"], residuals: Residuals | PublishedResiduals
 ) -> dict[str, Tensor]:
     """Return all but the colours of corrected cells."""
-    means, quats, log_scales, logits = (
-        values.index_select(0, cells)
-        for values in (merged.means, merged.quats, merged.log_scales, merged.logit_opacities)
-    )
+    quats = merged.quats.index_select(0, cells)
+    log_scales = merged.log_scales.index_select(0, cells)
+    logits = merged.logit_opacities.index_select(0, cells)
     axes = parameters.rotation_matrices(quats)
     moves = torch.einsum("mij,mj->mi", axes, torch.exp(log_scales) * residuals.d_means)
+    # A rotation v about the local axes multiplies by (1, v / 2) and keeps the length.
+    half = (residuals.d_rotvecs / 2).clamp(-_LARGEST, _LARGEST)  # squares must not overflow
+    turns = torch.cat([torch.ones_like(half[:, :1]), half], dim=1)
+    lengths = torch.sqrt(1 + half.square().sum(dim=1, keepdim=True))
     return {
-        "means": means + moves,
-        "quats": _rotate(quats, residuals.d_rotvecs),
+        "means": merged.means.index_select(0, cells) + moves,
+        "quats": parameters.multiply_quats(quats, turns) / lengths,
         "log_scales": log_scales + residuals.d_log_scales,
         "logit_opacities": logits + residuals.d_logit_opacities,
     }
-
-
-def _rotate(quats: Float[Tensor, "m 4"], rotvecs: Float[Tensor, "m 3"]) -> Float[Tensor, "m 4"]:
-    """Rotate about the local axes: multiply by ``(1, v / 2)`` and keep the length."""
-    half = (rotvecs / 2).clamp(-_LARGEST, _LARGEST)  # squares must not overflow
-    factor = torch.cat([torch.ones_like(half[:, :1]), half], dim=1)
-    length = torch.sqrt(1 + half.square().sum(dim=1, keepdim=True))
-    return parameters.multiply_quats(quats, factor) / length

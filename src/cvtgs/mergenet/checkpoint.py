@@ -244,9 +244,7 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
     return info
 
 
-def build_network(
-    architecture: Architecture | PublishedArchitecture,
-) -> Net:
+def build_network(architecture: Architecture | PublishedArchitecture) -> Net:
     """Build an untrained network in float32 on the CPU, which changes nothing.
 
     Example:
