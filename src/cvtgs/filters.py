@@ -12,13 +12,7 @@ from cvtgs.math.parameters import divide
 from cvtgs.math.segments import running_sums, true_rows
 from cvtgs.scene import GaussianScene
 
-__all__ = [
-    "FLYAWAY_RADII",
-    "FilteredRows",
-    "filter_rows",
-    "flyaway_rows",
-    "visible_rows",
-]
+__all__ = ["FLYAWAY_RADII", "FilteredRows", "filter_rows", "flyaway_rows", "visible_rows"]
 
 FLYAWAY_RADII = 100.0
 """Distance beyond which a Gaussian may be a flyaway, in robust radii; no sky lies so far."""

@@ -237,11 +237,7 @@ def allocation_at(ratio: float, config: AllocationConfig) -> AllocationConfig:
 
 
 def curve_order(
-    scene: GaussianScene,
-    rows: Int[Tensor, "k"],
-    frame: RobustFrame,
-    *,
-    masses: Float[Tensor, "k"],
+    scene: GaussianScene, rows: Int[Tensor, "k"], frame: RobustFrame, *, masses: Float[Tensor, "k"]
 ) -> Int[Tensor, "k"]:
     """Return the order of Gaussians along a Morton curve, ties by mass.
 

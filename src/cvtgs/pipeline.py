@@ -13,35 +13,19 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs import cells, cvt
-from cvtgs.analysis import (
-    SceneAnalysis,
-    drop_unused_bands,
-    restore_columns,
-)
+from cvtgs.analysis import SceneAnalysis, drop_unused_bands, restore_columns
 from cvtgs.clock import StageClock
 from cvtgs.config import MergeConfig, SimplifyConfig
 from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
-from cvtgs.grouping import (
-    OrderedRows,
-    allocate,
-    collect_cells,
-    tessellate_rows,
-    weigh_rows,
-)
+from cvtgs.grouping import OrderedRows, allocate, collect_cells, tessellate_rows, weigh_rows
 from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import Net, correct_cells
 from cvtgs.report import CellStatistics, MatchReport
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities
 
-__all__ = [
-    "Merged",
-    "Reduced",
-    "level_facts",
-    "merge_and_inflate",
-    "reduce_scene",
-]
+__all__ = ["Merged", "Reduced", "level_facts", "merge_and_inflate", "reduce_scene"]
 
 NEIGHBORS = 8
 """Number of neighbouring cells that may cover the ends of a cell, and that the network sees."""

@@ -38,8 +38,10 @@ Result = TypeVar("Result")
 
 def check_cameras(cameras: Cameras | None, config: SimplifyConfig) -> None:
     """Raise if cameras were given, but too few for a configuration that renders images."""
+    if cameras is None:
+        return
     least = 2 if config.refine.enabled else 1
-    if cameras is not None and len(checked_cameras(cameras)) < least and config.uses_images:
+    if len(checked_cameras(cameras)) < least and config.uses_images:
         raise InvalidArgumentError(
             f"preset {config.preset} needs at least {least} "
             f"{'cameras, one of them to be held out' if least > 1 else 'camera'}; "

@@ -123,11 +123,7 @@ class Simplifier:
         )
 
     def levels(
-        self,
-        scene: SceneLike,
-        rhos: Sequence[float],
-        *,
-        cameras: Cameras | None = None,
+        self, scene: SceneLike, rhos: Sequence[float], *, cameras: Cameras | None = None
     ) -> tuple[Level, ...]:
         """Simplify a scene to several levels, in less time than separate runs.
 

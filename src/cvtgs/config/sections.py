@@ -13,23 +13,17 @@ Choice = Literal["auto", "on", "off"]
 Less = Literal["auto", "off"]
 
 
-def _number_of_text(value: object) -> object:
+def _degree_of_text(value: object) -> object:
     """Parse a degree given as text; a truth value, which equals 0 or 1 in Python, is none."""
     if isinstance(value, bool):
         return str(value)
-    numbers = {str(degree): degree for degree in range(4)}
-    return numbers.get(value, value) if isinstance(value, str) else value
-
-
-def _degree_of_word(value: str | int) -> str | int:
-    """Return the degree of ``on`` (all bands) and ``off`` (none)."""
-    return {"on": 3, "off": 0}.get(str(value), value)
+    degrees = {"off": 0, "0": 0, "1": 1, "2": 2, "3": 3, "on": 3}
+    return degrees.get(value, value) if isinstance(value, str) else value
 
 
 Degree = Annotated[
     Literal["auto", "on", "off", 0, 1, 2, 3],
-    pydantic.BeforeValidator(_number_of_text),
-    pydantic.AfterValidator(_degree_of_word),
+    pydantic.BeforeValidator(_degree_of_text),
 ]
 
 
@@ -154,14 +148,7 @@ class AllocationConfig(Section):
 
 
 class ImageSection(Section):
-    """Base of the sections that render images of the scene.
-
-    Attributes:
-        size: Longer side of the images, pixels.
-        stride: Only every ``stride``-th pixel is used, along rows and columns.
-        fine_factor: About every second image is as sharp as one of ``fine_factor`` times the size;
-            1 for none.
-    """
+    """Base of the sections that render images of the scene."""
 
     size: int = pydantic.Field(default=128, ge=16)
     stride: Count = 1

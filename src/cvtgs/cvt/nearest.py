@@ -203,9 +203,7 @@ def _by_tree(
     return torch.from_numpy(rows), torch.from_numpy(distances)
 
 
-def runs_of_equal(
-    sites: Float[Tensor, "m d"],
-) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]] | None:
+def runs_of_equal(sites: Float[Tensor, "m d"]) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]] | None:
     """Return an order that makes coincident sites adjacent, and their ranks; None if all differ.
 
     Sites are sorted by a weighted sum of their coordinates, which is the same for equal ones. Where

@@ -8,12 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.config import TessellationConfig
-from cvtgs.cvt.nearest import (
-    NearestSite,
-    nearest_site,
-    search_device,
-    search_once_per_position,
-)
+from cvtgs.cvt.nearest import NearestSite, nearest_site, search_device, search_once_per_position
 from cvtgs.devices import move_together
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.segments import label_argmin, label_sums, running_sums, smallest_rows
@@ -84,11 +79,7 @@ def tessellate(
     if count == len(points):  # nothing to group
         own = torch.arange(count, device=home)
         return Tessellation(
-            labels=own,
-            sites=points.double(),
-            energies=(0.0,),
-            energy=0.0,
-            refilled=0,
+            labels=own, sites=points.double(), energies=(0.0,), energy=0.0, refilled=0
         )
     nearest = choose_search(has_duplicates=has_duplicates)
     points, weights = move_together([points, weights], search_device(home))
@@ -167,10 +158,7 @@ def sample_points(
 
 
 def fill_empty_cells(
-    labels: Int[Tensor, "n"],
-    weights: Float[Tensor, "n"],
-    squared: Float[Tensor, "n"],
-    count: int,
+    labels: Int[Tensor, "n"], weights: Float[Tensor, "n"], squared: Float[Tensor, "n"], count: int
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"], int]:
     """Move one point into every empty cell: the points of largest cost.
 
@@ -270,10 +258,7 @@ def lloyd(
 
 
 def weighted_sums(
-    points: Float[Tensor, "n d"],
-    weights: Float[Tensor, "n"],
-    labels: Int[Tensor, "n"],
-    count: int,
+    points: Float[Tensor, "n d"], weights: Float[Tensor, "n"], labels: Int[Tensor, "n"], count: int
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m d"]]:
     """Sum weights and weighted points per label, in float64.
 
@@ -286,9 +271,8 @@ def weighted_sums(
     Returns:
         Sums of the weights, and of the points times their weights.
     """
-    weights = weights.double()
-    columns = [weights, *(column.double() * weights for column in points.unbind(1))]
-    sums = label_sums(columns, labels, count)
+    columns = [torch.ones_like(weights), *points.unbind(1)]
+    sums = label_sums(columns, labels, count, weights.double())
     return sums[0], sums[1:].T
 
 
