@@ -7,7 +7,6 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType
 
 __all__ = [
     "CheckpointError",
@@ -115,15 +114,10 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
 
     Lines of cvtgs are skipped, and those between them: decorators of torch and of contextlib.
     """
-    level, frame = 1, sys._getframe()
-    while frame.f_back is not None and _is_within(frame):
+    level, frame, skipped = 1, sys._getframe(), {"cvtgs", "contextlib", "torch"}
+    while frame.f_back and str(frame.f_globals.get("__name__")).partition(".")[0] in skipped:
         level, frame = level + 1, frame.f_back
     warnings.warn(text, category, stacklevel=level)
-
-
-def _is_within(frame: FrameType) -> bool:
-    module = str(frame.f_globals.get("__name__"))
-    return module.partition(".")[0] in ("cvtgs", "contextlib", "torch")
 
 
 def reason_of(error: Exception) -> str:

@@ -188,13 +188,14 @@ class Partition:
         Yields:
             The range of cells of the run, and their partition.
         """
-        if len(self) and len(self.order) + cell_cost * len(self) <= max_members:
-            yield slice(0, len(self)), self
+        count = len(self)
+        if count and len(self.order) + cell_cost * count <= max_members:
+            yield slice(0, count), self
             return
         first, costs = 0, self.offsets.cpu()
         if cell_cost:
             costs = costs + cell_cost * torch.arange(len(costs), device="cpu")
-        while first < len(self):
+        while first < count:
             fitting = torch.searchsorted(costs, costs[first] + max_members, right=True)
             last = max(first + 1, int(fitting) - 1)
             yield slice(first, last), self.cut(slice(first, last))
