@@ -96,11 +96,10 @@ def reduce_scene(
         return Reduced(standardized(scene) if target < total else with_finite_opacities(scene))
     used = drop_unused_bands(scene, analysis.plan)
     with clock.stage("filter"):
-        filtered = filter_rows(used, analysis, target, config.filter)
-    left_out, left_out_mass_share = filtered.left_out, filtered.left_out_mass_share
+        rows, left_out, left_out_mass_share = filter_rows(used, analysis, target, config.filter)
     with clock.stage("weigh"):
-        points = weigh_rows(used, filtered.rows, analysis, config, ordered=ordered)
-    del filtered  # frees memory
+        points = weigh_rows(used, rows, analysis, config, ordered=ordered)
+    del rows  # frees memory
     with clock.stage("tessellate", config.cvt.iterations + 1) as advance:
         tessellation = tessellate_rows(points, analysis, target, config, on_iteration=advance)
     with clock.stage("allocate"):

@@ -92,11 +92,9 @@ def _pulls(
 
 def _open_pairs(logs: Float[Tensor, "r 3"]) -> Float[Tensor, "r 3 3"]:
     """Return 1 where two axes have about equal length, directly or via the third one, else 0."""
-    near = 2 * logs.diff(dim=1).abs() < EQUAL_SHARE
-    first, second = near.double().unbind(1)
-    one = torch.ones_like(first)
-    rows = [one, first, first * second, first, one, second, first * second, second, one]
-    return torch.stack(rows, dim=1).reshape(-1, 3, 3)
+    steps = 2 * logs.diff(dim=1).abs() >= EQUAL_SHARE
+    groups = torch.nn.functional.pad(steps.cumsum(1), (1, 0))
+    return (groups[:, :, None] == groups[:, None]).double()
 
 
 def inflate_cells(

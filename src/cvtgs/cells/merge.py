@@ -100,8 +100,7 @@ def merge_cells(
                 extras[name][of_cells] = values.to(column.dtype)
             else:
                 extras[name][of_cells] = column[heaviest]
-        count: int = run.stop - run.start
-        return count
+        return len(part)
 
     for count in in_threads(merge_chunk, several.chunks(chunk), scene.means.device):
         done += count

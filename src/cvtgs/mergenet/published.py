@@ -127,13 +127,8 @@ def describe_published(
         relative,
         opacities[:, None],
         shares[:, None],
-        *(
-            (
-                getattr(scene, name).index_select(0, rows)
-                - getattr(merged, name).index_select(0, own)
-            ).flatten(1)
-            for name in ("sh0", "shN")
-        ),
+        (scene.sh0.index_select(0, rows) - merged.sh0.index_select(0, own)).flatten(1),
+        (scene.shN.index_select(0, rows) - merged.shN.index_select(0, own)).flatten(1),
     ]
     members = torch.cat(columns, dim=1)
     missing = PUBLISHED_FEATURES - members.shape[1]

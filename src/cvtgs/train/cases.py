@@ -65,14 +65,7 @@ def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> Me
     merged = merge_and_inflate(
         valid, partition, config.merge, areas=analysis.areas, with_network=True
     )
-    return MergedScene(
-        valid,
-        merged.scene,
-        merged.partition,
-        merged.neighbors,
-        analysis.visibility,
-        analysis.frame.radius,
-    )
+    return MergedScene(valid, *merged, analysis.visibility, analysis.frame.radius)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
