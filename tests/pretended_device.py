@@ -42,6 +42,9 @@ WAITS = {
 
 INDEXING = {"aten::index", "aten::index_put_", "aten::index_put", "aten::_index_put_impl_"}
 
+MOST_EIGENPROBLEMS = 1000
+"""cuSOLVER takes half a megabyte for each, and fails with some ten thousand."""
+
 ANY_ORDER = {"cumsum", "cumprod", "logcumsumexp", "index_add", "scatter_add", "histc"}
 """Operations that add floats in arbitrary order on CUDA; ``check_order`` handles others."""
 
@@ -123,6 +126,8 @@ class Device(TorchDispatchMode):
         if wrapped:
             self.check(name, args, leaves)
             check_order(name, args, kwargs)
+            if name == "aten::_linalg_eigh" and args[0].shape[:-2].numel() > MOST_EIGENPROBLEMS:
+                raise RuntimeError("cusolver error: CUSOLVER_STATUS_INVALID_VALUE")
             is_mask = name in INDEXING and any(
                 i is not None and i.dtype == torch.bool for i in args[1]
             )

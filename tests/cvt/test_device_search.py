@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from cvtgs.cvt import device_search
+from cvtgs.cvt import device_search, nearest, nearest_neighbors, nearest_several, nearest_site
 from cvtgs.cvt.device_search import nearest_in_tiles
 from cvtgs.cvt.leaves import Boxes, boxes_of, home_leaves, split_sites
 from pretended_device import pretended_cuda
@@ -136,3 +136,39 @@ def test_boxes_are_rounded_outwards():
     assert found.low.dtype == torch.float32
     assert (found.low.double() <= boxes.low / torch.tensor(0.1)).all()
     assert (found.high.double() >= boxes.high / torch.tensor(0.1)).all()
+
+
+def test_sites_at_one_position_have_neighbours_of_their_own():
+    """Tiles break ties alike for all their points, which would then share a few neighbours."""
+    places = torch.cat([torch.zeros(200, 3), cloud(100, 3).float()])
+    with pretended_cuda():
+        rows = nearest_neighbors(places.to("cuda"), 6).cpu()
+    assert len(rows[:200].unique()) > 150
+    assert bool((rows != torch.arange(300)[:, None]).all())
+
+
+def test_several_sites_at_one_position_are_all_found():
+    places = torch.cat([torch.zeros(200, 3), cloud(100, 3).float()])
+    with pretended_cuda():
+        found = nearest_several(places.to("cuda"), places.to("cuda"), 7)
+        rows, distances = (values.cpu() for values in found)
+    assert all(len(set(row)) == 7 for row in rows.tolist())
+    torch.testing.assert_close(distances, smallest(places, places, 7), rtol=1e-6, atol=1e-7)
+
+
+def test_a_search_among_sites_at_one_position_looks_at_one(monkeypatch):
+    searched = []
+
+    def search(points, sites):
+        searched.append(len(sites))
+        return nearest_in_tiles(points, sites)
+
+    monkeypatch.setattr(nearest, "nearest_in_tiles", search)
+    points, sites = cloud(100, 3), torch.cat([torch.zeros(500, 3), torch.ones(1, 3)]).double()
+    with pretended_cuda():
+        found = nearest_site(points.to("cuda"), sites.to("cuda"))
+        labels, squared = (values.cpu() for values in found)
+    assert searched == [2]
+    wanted = smallest(points, sites, 1)[:, 0]
+    torch.testing.assert_close(squared.sqrt(), wanted)
+    torch.testing.assert_close((points - sites[labels]).norm(dim=1), wanted)

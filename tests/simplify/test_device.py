@@ -40,7 +40,8 @@ def by_tree(points, sites, count=1):
 def computed_as_on_the_cpu(monkeypatch):
     """Use the CPU's search and its eigenvectors, so that everything else gives the same bits."""
     monkeypatch.setattr("cvtgs.cvt.nearest.nearest_in_tiles", by_tree)
-    monkeypatch.setattr("cvtgs.math.parameters.symmetric_eigen", torch.linalg.eigh)
+    for user in ("math.parameters", "cells.inflate"):
+        monkeypatch.setattr(f"cvtgs.{user}.symmetric_eigen", torch.linalg.eigh)
 
 
 def on_device(scene):
@@ -287,3 +288,14 @@ def test_two_gaussians_on_a_device(preset):
     with pretended_cuda():
         small = Simplifier(config=preset, device="cuda").simplify(scene, count=2)
         assert same_bits(small.to("cpu"), wanted)
+
+
+def test_axes_of_many_equal_spheres_are_found_on_a_device():
+    """Neighbours turn axes of equal length: one more problem of eigenvectors per cell."""
+    steps = torch.arange(14, dtype=torch.float32)
+    means = torch.cartesian_prod(steps, steps, steps)
+    sphere = random_scene(1).select(torch.zeros(len(means), dtype=torch.int64))
+    spheres = sphere.with_tensors({"means": means, "log_scales": torch.full_like(means, -1.0)}, {})
+    with pretended_cuda():
+        small = Simplifier(None, config="fast", device="cuda").simplify(spheres.to("cuda"), 0.5)
+        assert len(on_device(small)) == 14**3 // 2

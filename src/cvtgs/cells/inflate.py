@@ -9,6 +9,7 @@ from torch import Tensor
 from cvtgs.cells.partition import Partition
 from cvtgs.devices import chunk_length, in_threads
 from cvtgs.math import parameters
+from cvtgs.math.eigen import symmetric_eigen
 from cvtgs.math.segments import gather_columns, take_columns
 from cvtgs.scene import GaussianScene
 
@@ -66,7 +67,7 @@ def align_axes(
     pulls = axes.mT @ _pulls(merged.means, rows, neighbors[rows]) @ axes
     # Logarithms, because the thin axes of a needle would vanish next to its length.
     pulled = torch.diag_embed(2 * (logs - logs[:, :1])) + NEIGHBOR_PULL * pulls * _open_pairs(logs)
-    rotations = torch.linalg.eigh(pulled).eigenvectors.flip(-1)
+    rotations = symmetric_eigen(pulled)[1].flip(-1)
     quats = parameters.matrices_to_quats(parameters.canonical_axes(axes @ rotations))
     changes = {"log_scales": (rotations.square() * logs[:, :, None]).sum(dim=1), "quats": quats}
     tensors = {

@@ -54,8 +54,9 @@ def nearest_site(
     """
     if points.device.type != "cuda":
         return nearest_scipy(points, sites)
-    labels, squared = nearest_in_tiles(points, sites)
-    return labels[:, 0], squared[:, 0]
+    distinct = _one_of_each(sites)
+    labels, squared = nearest_in_tiles(points, sites if distinct is None else sites[distinct])
+    return labels[:, 0] if distinct is None else distinct[labels[:, 0]], squared[:, 0]
 
 
 def nearest_scipy(
@@ -80,10 +81,7 @@ def nearest_scipy(
         [1]
     """
     device, points, sites = points.device, points.cpu(), sites.cpu()
-    distinct, runs = None, runs_of_equal(sites)
-    if runs is not None:  # a tree cannot separate coincident sites: it would compare all
-        order, ranks = runs
-        distinct = torch.sort(order[ranks == 0]).values
+    distinct = _one_of_each(sites)
     tree = build_tree(sites if distinct is None else sites[distinct])
     labels = np.empty(len(points), dtype=np.int64)
     squared = np.empty(len(points), dtype=np.float64)
@@ -97,6 +95,12 @@ def nearest_scipy(
     if distinct is not None:
         found = distinct[found]
     return found.to(device), torch.from_numpy(squared).to(device)
+
+
+def _one_of_each(sites: Float[Tensor, "m d"]) -> Int[Tensor, "k"] | None:
+    """Return one row of every position, since trees cannot separate the others; None for all."""
+    runs = runs_of_equal(sites)
+    return None if runs is None else torch.sort(runs[0][runs[1] == 0]).values
 
 
 def _in_threads(search: Callable[[slice], None], count: int) -> None:
@@ -139,11 +143,8 @@ def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m
         [[1], [0], [1]]
     """
     with_self = min(count + 1, len(sites))
-    if sites.device.type == "cuda":
-        rows, _ = nearest_in_tiles(sites, sites, with_self)
-    else:
-        apart = _apart(sites.cpu())
-        rows, _ = _by_tree(apart, apart, with_self)
+    apart = _apart(sites.to(search_device(sites.device)))
+    rows, _ = _nearest_apart(apart, apart, with_self)
     # With coincident sites, the site itself may be anywhere or missing: then drop the last one.
     is_self = rows == torch.arange(len(sites), device=rows.device)[:, None]
     if bool(is_self[:, 0].all()):
@@ -165,20 +166,19 @@ def nearest_several(
     Returns:
         Rows of the sites, nearest first, and their distances.
     """
-    if sites.device.type == "cuda":
-        rows, squared = nearest_in_tiles(points, sites, min(count, len(sites)))
-        return rows, squared.sqrt()
-    apart = _apart(sites.cpu())
+    device = search_device(sites.device)
+    apart = _apart(sites.to(device))
     more = apart.shape[1] - points.shape[1]
-    padded = torch.nn.functional.pad(points.cpu().double(), (0, more))
-    rows, distances = _by_tree(padded, apart, min(count, len(sites)))
+    padded = torch.nn.functional.pad(points.to(device).double(), (0, more))
+    rows, distances = _nearest_apart(padded, apart, min(count, len(sites)))
     return rows.to(points.device), distances.to(points.device)
 
 
 def _apart(sites: Float[Tensor, "m d"]) -> Float[Tensor, "m e"]:
     """Add a coordinate that separates coincident sites, which a tree would compare pairwise.
 
-    It is so small that distances between distinct sites change only by rounding.
+    It is so small that distances between distinct sites change only by rounding. Without it, tiles
+    would find the same few of them for all.
     """
     runs = runs_of_equal(sites)
     if runs is None:
@@ -189,9 +189,13 @@ def _apart(sites: Float[Tensor, "m d"]) -> Float[Tensor, "m e"]:
     return torch.cat([places, shifts[:, None]], dim=1)
 
 
-def _by_tree(
+def _nearest_apart(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
+    """Find the nearest of sites that do not coincide, and their distances."""
+    if sites.device.type == "cuda":
+        found, squared = nearest_in_tiles(points, sites, count)
+        return found, squared.sqrt()
     tree, ranks = build_tree(sites), [*range(1, count + 1)]
     rows = np.empty((len(points), count), dtype=np.int64)
     distances = np.empty((len(points), count), dtype=np.float64)
@@ -216,6 +220,8 @@ def runs_of_equal(sites: Float[Tensor, "m d"]) -> tuple[Int[Tensor, "m"], Int[Te
     repeated = torch.zeros(len(sites), dtype=torch.bool, device=sites.device)
     ascending = keys.index_select(0, order)
     candidates = (ascending[1:] == ascending[:-1]).nonzero()[:, 0]
+    if len(candidates) == 0:
+        return None
     repeated[candidates + 1] = (sites[order[candidates + 1]] == sites[order[candidates]]).all(dim=1)
     if not bool(repeated.any()):
         return None

@@ -321,6 +321,7 @@ def _colors(scene: GaussianScene, rows: Tensor, offsets: Tensor, sh_degree: int)
     count = spherical_harmonics.REST_COUNTS[sh_degree]
     if not count:
         return spherical_harmonics.evaluate(sh0, scene.shN.new_zeros(len(rows), 0, 3), offsets)
-    directions = torch.nn.functional.normalize(offsets, dim=1)
+    # In float32, squares of more than 1e19 units are infinite.
+    directions = torch.nn.functional.normalize(offsets.double(), dim=1).to(offsets.dtype)
     shN = scene.shN[:, :count].index_select(0, rows)  # noqa: N806
     return spherical_harmonics.evaluate(sh0, shN, directions)
