@@ -1,4 +1,4 @@
-"""Processes of this machine that call functions, on all cores."""
+"""Workers, which call a function for many items: here, in other processes, or elsewhere."""
 
 import os
 import pickle
@@ -6,12 +6,12 @@ import signal
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Protocol, Self, TypeVar
 
 from cvtgs.errors import InvalidArgumentError, RunError
 from cvtgs.startup import load_torch
@@ -24,12 +24,36 @@ else:
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-
 WAKE_SECONDS = 0.5
 """Longest wait for a result at once: on Windows, Ctrl-C does not end a wait."""
 
 MOST_ON_WINDOWS = 61
 """Largest number of processes that a pool of Python has on Windows."""
+
+
+class Workers(Protocol):
+    """Calls a function for every item, in this process (as ``map`` does) or in others."""
+
+    def __call__(
+        self, function: Callable[[Item], Result], items: Sequence[Item], /
+    ) -> Iterable[Result]:
+        """Call the function for every item.
+
+        Args:
+            function: A function that can be pickled.
+            items: The arguments; the calls are independent.
+
+        Returns:
+            The results, in the order of the items.
+        """
+        ...
+
+
+def with_progress(results: Iterable[Result], advance: Callable[[int], None]) -> Iterator[Result]:
+    """Yield the results, and report their number so far."""
+    for done, result in enumerate(results, start=1):
+        yield result
+        advance(done)
 
 
 def pool_size(count: int) -> int:

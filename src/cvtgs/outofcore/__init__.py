@@ -1,10 +1,15 @@
 """Simplify scenes that do not fit into memory in blocks of space, here or on a cluster."""
 
 from cvtgs.outofcore.distributed import ClusterWorkers, connect, simplify_distributed
-from cvtgs.outofcore.memory import available_memory, block_count, needed_memory, read_bytes
+from cvtgs.outofcore.memory import (
+    available_memory,
+    block_count,
+    needed_memory,
+    read_bytes,
+    worker_count,
+)
 from cvtgs.outofcore.run import check_config, simplify_file
-from cvtgs.outofcore.workers import Workers, worker_count
-from cvtgs.processes import LocalWorkers
+from cvtgs.processes import LocalWorkers, Workers
 
 __all__ = [
     "ClusterWorkers",

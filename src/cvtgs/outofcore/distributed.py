@@ -25,7 +25,7 @@ from cvtgs.errors import (
 )
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.run import simplify_file
-from cvtgs.outofcore.workers import Item, Result
+from cvtgs.processes import Item, Result
 from cvtgs.report import SimplifyReport
 
 if TYPE_CHECKING:

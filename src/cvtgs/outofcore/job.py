@@ -5,6 +5,8 @@ import json
 import os
 import shutil
 import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -15,6 +17,7 @@ import torch
 import cvtgs
 from cvtgs.boxes import Box
 from cvtgs.cameras import Cameras
+from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.errors import CvtgsError, OutputError, reason_of
 from cvtgs.io import atomic_output
@@ -25,6 +28,7 @@ from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import Checkpoint, Net, load_checkpoint, save_checkpoint
 from cvtgs.outofcore.memory import CELL_ROOM
 from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, write_scan
+from cvtgs.processes import Workers
 
 SENT_BYTES = "sent_bytes"
 """Entry of the label file of a block: bytes of the file of its sent rows."""
@@ -339,6 +343,30 @@ class Job:
                 whole = False
             if not whole:
                 name.unlink(missing_ok=True)
+
+
+@contextmanager
+def started(
+    job: Job, workers: Workers, clock: StageClock, checkpoint: Checkpoint | None, *, resumes: bool
+) -> Iterator[None]:
+    """Make the folder of a job and write its network, unless it resumes; check the workers.
+
+    The folder is removed if the job fails before there is anything to resume.
+    """
+    try:
+        if not resumes:
+            job.start_over()
+        check: Callable[[Job], object] | None = getattr(workers, "check", None)
+        if check is not None:  # workers on other machines
+            with clock.stage("workers"):
+                check(job)
+        if not resumes and checkpoint is not None:
+            job.write_network(checkpoint)
+        yield
+    except CvtgsError:
+        if not resumes:
+            shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
+        raise
 
 
 def job_folder(output: str | os.PathLike[str], key: str) -> str:

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cvtgs.counts import whole_number
+from cvtgs.devices import core_count
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.ply import PlyRows
 from cvtgs.outofcore.scan import SAMPLE_ROWS
+from cvtgs.processes import pool_size
 
 BASE_BYTES = 450_000_000
 """Interpreter, torch and scipy (280 MB), network, sample, grid of depths, and a chunk of rows."""
@@ -228,3 +230,21 @@ def block_count(source: PlyRows, memory: int, *, merging: int = 0) -> int:
     wanted = needed_memory(source, source.count) - BASE_BYTES
     room = (memory if memory > base else LEAST_BYTES) - base
     return SHARED_BY * math.ceil(2 * wanted / room / SHARED_BY)
+
+
+def worker_count(memory: int, wanted: int | None = None) -> int:
+    """Choose the number of processes that work on blocks.
+
+    Args:
+        memory: Bytes for all processes together.
+        wanted: The wanted number; None for one per core.
+
+    Returns:
+        At least 1, and at most one per GB, which torch and a block of some size need; on Windows,
+        at most 61.
+
+    Example:
+        >>> worker_count(4_000_000_000, 8)
+        4
+    """
+    return pool_size(max(1, min(wanted or core_count(), memory // (2 * ROOMY_BYTES))))

@@ -25,7 +25,7 @@ from cvtgs.io.ply import PlyRows, join_plys, open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.outofcore.allocate import allocate, join
 from cvtgs.outofcore.improve import improve, join_matchings, join_refinements
-from cvtgs.outofcore.job import Job, Manifest, job_folder
+from cvtgs.outofcore.job import Job, Manifest, job_folder, started
 from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
 from cvtgs.outofcore.memory import (
     IMAGE_BYTES,
@@ -41,14 +41,8 @@ from cvtgs.outofcore.rows import kept_rows
 from cvtgs.outofcore.scan import CHUNK
 from cvtgs.outofcore.sort import sort_into_blocks
 from cvtgs.outofcore.visibility import add_contributions, measure
-from cvtgs.outofcore.workers import (
-    Result,
-    Workers,
-    sequentially,
-    started,
-    with_progress,
-)
 from cvtgs.prepared import check_cameras
+from cvtgs.processes import Result, Workers, with_progress
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport, origin_of_views
 from cvtgs.scene import GaussianScene, concatenate
@@ -136,7 +130,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         (20, 3)
     """
     simplifier = simplifier or Simplifier(device="cpu")
-    workers = workers or sequentially
+    workers = workers or map
     check_config(simplifier.config)
     check_cameras(cameras, simplifier.config)
     check_save(output, overwrite=overwrite)

@@ -36,7 +36,7 @@ from cvtgs.outofcore.scan import (
     scan_scene,
 )
 from cvtgs.outofcore.visibility import write_views
-from cvtgs.outofcore.workers import Workers, with_progress
+from cvtgs.processes import Workers, with_progress
 from cvtgs.scene import GaussianScene
 
 

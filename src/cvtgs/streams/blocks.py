@@ -27,13 +27,13 @@ from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
 from cvtgs.mergenet import Net
 from cvtgs.outofcore import Workers, available_memory, block_count, check_config
-from cvtgs.outofcore.job import Job, job_folder
+from cvtgs.outofcore.job import Job, job_folder, started
 from cvtgs.outofcore.memory import memory_to_plan, sample_rows
 from cvtgs.outofcore.rows import analysis_of, read_rows
 from cvtgs.outofcore.run import rows_per_range
 from cvtgs.outofcore.sort import sort_into_blocks
-from cvtgs.outofcore.workers import sequentially, started, with_progress
 from cvtgs.pipeline import level_facts, reduce_scene
+from cvtgs.processes import with_progress
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.scene import GaussianScene
 from cvtgs.simplifier import Simplifier
@@ -206,7 +206,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
             f"{SCENE_AXES}, found {axes[1]!r}."
         )
     check_environment(environment_radii)
-    simplifier, workers = simplifier or Simplifier(device="cpu"), workers or sequentially
+    simplifier, workers = simplifier or Simplifier(device="cpu"), workers or map
     check_config(simplifier.config, with_images=False)
     rows = open_rows(source)
     rows = replace(rows, path=str(Path(rows.path).absolute()))  # for workers in other folders
