@@ -13,7 +13,6 @@ from cvtgs.cells import Moments
 from cvtgs.cvt import nearest_several
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.grouping import REASSIGN, allocation_at
-from cvtgs.io.tensors import map_tensors
 from cvtgs.math.segments import take_columns
 from cvtgs.mergenet import correct_cells
 from cvtgs.outofcore import simplify_file
@@ -45,13 +44,14 @@ def courtyard_job(folder, *, comments=()):
     return unfinished_job(scene, folder, count=TARGET, blocks=BLOCKS, config=config)
 
 
-def of_all(job, path, name):
-    return torch.cat([map_tensors(path(block))[0][name] for block in job.blocks_with_cells()])
+def of_all(job, step, name, iteration=None):
+    blocks = job.blocks_with_cells()
+    return torch.cat([job.read(step, block, iteration)[name] for block in blocks])
 
 
-def scene_of_all(job, path):
+def scene_of_all(job, step):
     names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
-    return cvtgs.GaussianScene(**{name: of_all(job, path, name) for name in names})
+    return cvtgs.GaussianScene(**{name: of_all(job, step, name) for name in names})
 
 
 def block_starts(job):
@@ -69,9 +69,7 @@ def random_blocks(count, dim, *, seed=0):
 
 def others_of(blocks, own):
     return [
-        OtherBlock(k, bounding_box(sites), lambda sites=sites: sites)
-        for k, (_, sites) in enumerate(blocks)
-        if k != own
+        OtherBlock(k, bounding_box(sites), sites) for k, (_, sites) in enumerate(blocks) if k != own
     ]
 
 
@@ -105,7 +103,7 @@ def test_the_nearest_site_is_found_in_any_block(count, dim):
 
 
 def test_a_tie_goes_to_the_site_in_the_own_block():
-    others = [OtherBlock(3, torch.tensor([[2.0], [2.0]]), lambda: torch.tensor([[2.0]]))]
+    others = [OtherBlock(3, torch.tensor([[2.0], [2.0]]), torch.tensor([[2.0]]))]
     found = assign_points(
         torch.tensor([[1.0]]), torch.zeros(1, 1).double(), others, nearest=cvt.nearest_scipy
     )
@@ -150,42 +148,42 @@ def test_a_halo_holds_all_possible_neighbours(count):
 @pytest.mark.parametrize(("place", "cells_found"), [(3.0, [[7, 0]]), (5.0, [])])
 def test_a_halo_reaches_as_far_as_the_last_own_neighbour(place, cells_found):
     centers, theirs = torch.tensor([[0.0, 0, 0], [0, 0, 4]]), torch.tensor([[place, 0.0, 0.0]])
-    others = [OtherBlock(7, bounding_box(theirs), lambda: theirs)]
+    others = [OtherBlock(7, bounding_box(theirs), theirs)]
     assert halo_cells(centers, others, count=1).tolist() == cells_found
 
 
 def test_points_weigh_as_in_one_piece(job):
     config, parts = job.config.cvt, []
     for block in job.blocks_with_rows():
-        rows, order = read_rows(job, block), map_tensors(job.sample_path(block))[0]["order"]
+        rows, order = read_rows(job, block), job.read("sample", block)["order"]
         parts.append((rows.scene.opacities[order.long()], rows.apparent_areas[order.long()]))
     opacities, areas = (torch.cat(values) for values in zip(*parts, strict=True))
     wanted = cvt.tessellation_weights(
         opacities, areas, area_power=config.area_power, floor=config.weight_floor
     )
     assert int((wanted == config.weight_floor).sum()) > 10
-    torch.testing.assert_close(of_all(job, job.sample_path, "weights"), wanted)
+    torch.testing.assert_close(of_all(job, "sample", "weights"), wanted)
 
 
 def test_sites_move_as_in_one_piece(job):
-    points = of_all(job, job.sample_path, "points")
-    weights = of_all(job, job.sample_path, "weights")
-    sites = of_all(job, lambda block: job.sites_path(0, block), "sites")
+    points = of_all(job, "sample", "points")
+    weights = of_all(job, "sample", "weights")
+    sites = of_all(job, "sites", "sites", 0)
     moves = len(list(job.path("").glob("sites_*_00000"))) - 1
     assert moves == job.config.cvt.iterations
     whole = cvt.lloyd(
         points, weights, sites, nearest=cvt.nearest_scipy, iterations=moves, tolerance=0.0
     )
-    moved = of_all(job, lambda block: job.sites_path(moves, block), "sites")
+    moved = of_all(job, "sites", "sites", moves)
     torch.testing.assert_close(moved, whole.sites)
 
 
 def test_gaussians_go_to_cells_of_other_blocks(job):
-    labels = [map_tensors(job.labels_path(block))[0] for block in job.blocks_with_cells()]
+    labels = [job.read("labels", block) for block in job.blocks_with_cells()]
     left = sum(int((one["labels"] < 0).sum()) for one in labels)
     assert left == sum(int(one["sent"].sum()) for one in labels) > COUNT // 50
     scan = job.read_scan()
-    sizes = of_all(job, job.merged_path, "sizes")
+    sizes = of_all(job, "merged", "sizes")
     assert (len(sizes), int(sizes.amin())) == (TARGET, 1)
     blocks = job.blocks_with_cells()
     members = sum(int(read_cells(job, block).partition.counts.sum()) for block in blocks)
@@ -201,7 +199,7 @@ def in_order(columns):
 def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
     starts, scenes, labels, areas = torch.tensor([0, *job.cells]).cumsum(0), [], [], []
     for block in job.blocks_with_rows():
-        rows, (parts, _) = read_rows(job, block), map_tensors(job.parts_path(block))
+        rows, parts = read_rows(job, block), job.read("parts", block)
         of_parts = [torch.arange(job.cells[block]) + starts[block]]
         of_parts.append(starts[parts["remote"][:, 0]] + parts["remote"][:, 1])
         labels.append(torch.cat(of_parts)[parts["parts"].long()])
@@ -224,9 +222,7 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
     near = cvt.nearest_neighbors(whole.means.T, config.neighbors)
     merged = cells.merge_pairs(whole, near, TARGET, config)
     wanted = cells.group_moments(whole, merged, TARGET)
-    found = torch.cat(
-        [map_tensors(job.groups_path(block))[0]["means"] for block in job.blocks_with_cells()], 1
-    )
+    found = torch.cat([job.read("groups", block)["means"] for block in job.blocks_with_cells()], 1)
     torch.testing.assert_close(in_order(found), in_order(wanted.means))
     # Every group keeps a Gaussian of the block with its heaviest cell; else all is as in one piece.
     blocks = torch.repeat_interleave(torch.arange(BLOCKS), torch.tensor(job.cells))
@@ -261,11 +257,11 @@ def test_cells_that_exceed_the_memory_are_merged_in_parts(tmp_path, monkeypatch)
 
 
 def test_cells_have_the_same_neighbours_as_in_one_piece(job):
-    merged = scene_of_all(job, job.merged_path)
+    merged = scene_of_all(job, "merged")
     wanted = cvt.nearest_neighbors(merged.means, 8)
     starts, crossed = block_starts(job), 0
     for block in job.blocks_with_cells():
-        own, _ = map_tensors(job.inflated_path(block))
+        own = job.read("inflated", block)
         remote = own["remote"]
         numbers = torch.cat(
             [
@@ -280,8 +276,8 @@ def test_cells_have_the_same_neighbours_as_in_one_piece(job):
 
 
 def test_axes_and_inflation_are_the_same_as_in_one_piece(job):
-    merged, inflated = scene_of_all(job, job.merged_path), scene_of_all(job, job.inflated_path)
-    sizes = of_all(job, job.merged_path, "sizes")
+    merged, inflated = scene_of_all(job, "merged"), scene_of_all(job, "inflated")
+    sizes = of_all(job, "merged", "sizes")
     partition = cells.Partition.from_labels(
         torch.repeat_interleave(torch.arange(TARGET), sizes), TARGET
     )
@@ -306,8 +302,7 @@ def test_the_network_corrects_as_in_one_piece(which, request):
         order=order, offsets=torch.nn.functional.pad(counts.cumsum(0), (1, 0))
     )
     representatives = [
-        map_tensors(job.merged_path(block))[0]["representatives"]
-        for block in job.blocks_with_cells()
+        job.read("merged", block)["representatives"] for block in job.blocks_with_cells()
     ]
     representatives = torch.cat(
         [
@@ -317,7 +312,7 @@ def test_the_network_corrects_as_in_one_piece(which, request):
     )
     shown = partition.keep_only(representatives)
     assert int((representatives >= 0).sum()) > 0
-    inflated = scene_of_all(job, job.inflated_path)
+    inflated = scene_of_all(job, "inflated")
     neighbors = cvt.nearest_neighbors(inflated.means, 8)
     wanted = validity.standardized(
         correct_cells(

@@ -8,7 +8,6 @@ import torch
 import cvtgs
 from block_jobs import unfinished_job
 from cvtgs import Simplifier, SimplifyConfig
-from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.outofcore import lloyd, simplify_file
 from cvtgs.outofcore.halo import Assignment, bounding_box
 from cvtgs.outofcore.job import Job, Manifest
@@ -39,10 +38,10 @@ def job_on_a_line(tmp_path, monkeypatch):
         for block, (points, sites) in enumerate(blocks):
             positions, weights = torch.tensor(points).T
             tensors = {"points": positions[:, None], "weights": weights}
-            save_tensors(job.sample_path(block), tensors, {})
+            job.write("sample", block, tensors)
             first = torch.tensor(sites).double()[:, None]
             tensors = {"sites": first, "bounds": bounding_box(first)}
-            save_tensors(job.sites_path(0, block), tensors, {})
+            job.write("sites", block, tensors, 0)
         return job
 
     return make
@@ -52,8 +51,8 @@ def moved_sites(job):
     for block in range(job.blocks):
         accumulate(job, 0, block)
     move_sites(job, 0)
-    paths = [job.sites_path(1, block) for block in range(job.blocks)]
-    return [map_tensors(path)[0]["sites"][:, 0].tolist() for path in paths]
+    sites = [job.read("sites", block, 1)["sites"] for block in range(job.blocks)]
+    return [of_block[:, 0].tolist() for of_block in sites]
 
 
 OWN = ([(0.0, 1.0), (1.0, 1.0)], [0.0, 10.0])
@@ -70,10 +69,13 @@ def test_a_site_goes_to_the_block_with_most_of_its_weight(job_on_a_line, weight,
     third = ([(9.0, weight), (30.0, 1.0), (30.0, 1.0)], [30.0])
     job = job_on_a_line(OWN, second, third)
     assert moved_sites(job) == wanted
-    before = job.sites_path(1, 0).read_bytes(), job.sites_path(1, 1).read_bytes()
-    job.sites_path(1, 1).unlink()  # as if the run ended before it was written
+    before = job.step_path("sites", 0, 1).read_bytes(), job.step_path("sites", 1, 1).read_bytes()
+    job.step_path("sites", 1, 1).unlink()  # as if the run ended before it was written
     move_sites(job, 0)
-    assert (job.sites_path(1, 0).read_bytes(), job.sites_path(1, 1).read_bytes()) == before
+    assert (
+        job.step_path("sites", 0, 1).read_bytes(),
+        job.step_path("sites", 1, 1).read_bytes(),
+    ) == before
 
 
 def test_a_site_with_points_of_its_block_stays_there(job_on_a_line):
@@ -97,11 +99,11 @@ def test_far_points_of_other_blocks_stay_alone(tmp_path):
     """A near point of the site's own block, beside one a million radii away, made a huge cell."""
     scene, config = flown(800, torch.float32, 1e6), SimplifyConfig(preset="paper")
     job = unfinished_job(scene, tmp_path, count=40, blocks=2, config=config)
-    merged = [map_tensors(job.merged_path(block))[0]["log_scales"] for block in range(2)]
+    merged = [job.read("merged", block)["log_scales"] for block in range(2)]
     assert torch.cat(merged).shape == (40, 3)
     assert torch.cat(merged).max() < 0.0
-    sites = [job.sites_path(config.cvt.iterations, block) for block in range(2)]
-    counts = [len(map_tensors(path)[0]["sites"]) for path in sites]
+    sites = [job.read("sites", block, config.cvt.iterations)["sites"] for block in range(2)]
+    counts = [len(of_block) for of_block in sites]
     assert sum(counts) == sum(job.cells) == 40
     assert counts != list(job.cells)
 

@@ -19,7 +19,6 @@ from cvtgs.devices import one_thread
 from cvtgs.errors import warn
 from cvtgs.grouping import REASSIGN, allocation_at
 from cvtgs.io import atomic_output
-from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.math.segments import segment_argmax, sort_by_label, take_columns
 from cvtgs.outofcore.halo import number_remote
 from cvtgs.outofcore.job import SENT_BYTES, Job
@@ -60,9 +59,8 @@ def _members(job: Job, rows: BlockRows, components: Tensor | None = None) -> Mom
 
 def allocate(job: Job) -> None:
     """Choose the cells of all blocks that merge, and write the groups of every block."""
-    if job.path("targets.json").exists() and all(
-        job.groups_path(block).exists() for block in job.blocks_with_sites()
-    ):
+    is_done = all(job.has("groups", block) for block in job.blocks_with_sites())
+    if is_done and job.path("targets.json").exists():
         return
     manifest = job.read_manifest()
     cell_counts = _cell_counts(job)
@@ -101,7 +99,7 @@ def _cell_counts(job: Job) -> list[int]:
     """Return the number of cells in each block after Lloyd, which moves some to other blocks."""
     counts = [0] * job.blocks
     for block in job.blocks_with_sites():
-        counts[block] = _own_count(map_tensors(job.parts_path(block))[0])
+        counts[block] = _own_count(job.read("parts", block))
     return counts
 
 
@@ -139,7 +137,7 @@ def _allocate_region(
     tables = [table.split(counts.tolist(), dim=-1) for table in (*groups, keys[near])]
     for block, own, *table in zip(region, keys[labels].split(sizes.tolist()), *tables, strict=True):
         named = dict(zip((*Moments._fields, "near"), table, strict=True))
-        save_tensors(job.groups_path(block), {"groups": own, **named}, {})
+        job.write("groups", block, {"groups": own, **named})
     targets: list[int] = counts.tolist()
     return targets
 
@@ -158,7 +156,7 @@ def _add_parts(job: Job, region: Sequence[int], cell_counts: Sequence[int]) -> M
         total += cell_counts[block]
     found, labels = list[Moments](), list[Tensor]()
     for block in job.blocks_with_rows():
-        tensors, _ = map_tensors(job.parts_path(block))
+        tensors = job.read("parts", block)
         owners, numbers = _cells_of_parts(block, tensors)
         rows = (starts[owners] >= 0).nonzero()[:, 0]
         found.append(Moments(*take_columns(rows, *(tensors[name] for name in Moments._fields))))
@@ -180,9 +178,9 @@ def join(job: Job, block: int) -> None:
 
     Each group keeps the best-fitting Gaussian of its own block, so no group becomes empty.
     """
-    if job.labels_path(block).exists():
+    if job.has("labels", block):
         return
-    tensors, _ = map_tensors(job.parts_path(block))
+    tensors = job.read("parts", block)
     owners, numbers = _cells_of_parts(block, tensors)
     (groups,) = _take(job, owners * KEY + numbers, "groups")
     found = groups[tensors["parts"].long()]
@@ -195,7 +193,7 @@ def join(job: Job, block: int) -> None:
     sent = send_rows(job, block, owners, labels)
     labels = torch.where(owners < 0, labels, -1).int()
     facts = {SENT_BYTES: str(job.sent_path(block).stat().st_size)}
-    save_tensors(job.labels_path(block), {"labels": labels, "sent": sent}, facts)
+    job.write("labels", block, {"labels": labels, "sent": sent}, facts=facts)
 
 
 def _reassigned(
@@ -225,14 +223,10 @@ def _take(job: Job, keys: Int[Tensor, "k"], *names: str) -> list[Tensor]:
     """Read columns of tables in the group files of all blocks, by global key."""
     ascending, inverse = torch.unique(keys, return_inverse=True)
     parts: list[list[Tensor]] = [[] for _ in names]
-    for block, rows in _by_block(ascending):
-        tensors, _ = map_tensors(job.groups_path(block))
+    blocks, counts = torch.unique_consecutive(ascending // KEY, return_counts=True)
+    numbers = (ascending % KEY).split(counts.tolist())
+    for block, rows in zip(blocks.tolist(), numbers, strict=True):
+        tensors = job.read("groups", block)
         for name, values in zip(names, parts, strict=True):
             values.append(take_columns(rows, tensors[name])[0])
     return take_columns(inverse, *[torch.cat(values, dim=-1) for values in parts])
-
-
-def _by_block(keys: Int[Tensor, "k"]) -> list[tuple[int, Tensor]]:
-    """Return each block of ascending keys, with the numbers in it."""
-    blocks, counts = torch.unique_consecutive(keys // KEY, return_counts=True)
-    return list(zip(blocks.tolist(), (keys % KEY).split(counts.tolist()), strict=True))

@@ -1,9 +1,7 @@
 """The halo of a block: the nearest sites and cells of other blocks."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 from typing import NamedTuple, Self
 
 import torch
@@ -11,31 +9,27 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cvt import NearestSite, nearest_several
-from cvtgs.io.tensors import map_tensors
+from cvtgs.outofcore.job import Job, Step
 
 RUN = 1 << 9
 """Number of consecutive balls whose common box is tested before the single balls."""
 
 
 class OtherBlock(NamedTuple):
-    """Positions in another block, which are loaded lazily.
-
-    Attributes:
-        number: Number of the block.
-        bounds: ``(2, d)`` bounding box of the positions.
-        load: Loads the ``(m, d)`` positions, at least one.
-    """
+    """Positions in another block, at least one, and their bounding box."""
 
     number: int
-    bounds: Tensor
-    load: Callable[[], Tensor]
+    bounds: Float[Tensor, "2 d"]
+    positions: Float[Tensor, "m d"]
 
 
-def other_blocks(paths: Mapping[int, Path], *, name: str) -> Iterator[OtherBlock]:
-    """Return blocks from the paths of their files; the tensor ``name`` holds the positions."""
-    for block, path in paths.items():
-        tensors, _ = map_tensors(path)
-        yield OtherBlock(block, tensors["bounds"], partial(tensors.__getitem__, name))
+def other_blocks(
+    job: Job, step: Step, name: str, numbers: Iterable[int], iteration: int | None = None
+) -> Iterator[OtherBlock]:
+    """Map the positions that a step wrote for some blocks; ``name`` is that of the tensor."""
+    for number in numbers:
+        tensors = job.read(step, number, iteration)
+        yield OtherBlock(number, tensors["bounds"], tensors[name])
 
 
 def bounding_box(points: Float[Tensor, "n d"]) -> Float[Tensor, "2 d"]:
@@ -127,7 +121,7 @@ def assign_points(
         rows = balls.touching(other.bounds)
         if len(rows) == 0:
             continue
-        remote, distances = nearest(points[rows], other.load())
+        remote, distances = nearest(points[rows], other.positions)
         closer = distances < squared[rows]
         rows = rows[closer]
         blocks[rows], labels[rows] = other.number, remote[closer]
@@ -164,7 +158,7 @@ def halo_cells(
         rows = balls.touching(other.bounds)
         if len(rows) == 0:
             continue
-        cells, distances = nearest_several(centers[rows], other.load(), count)
+        cells, distances = nearest_several(centers[rows], other.positions, count)
         near = torch.unique(cells[distances.square() <= squared[rows][:, None]])
         found.append(torch.stack([torch.full_like(near, other.number), near], dim=1))
     return torch.cat(found)

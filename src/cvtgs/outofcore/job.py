@@ -5,14 +5,16 @@ import json
 import os
 import shutil
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Literal, get_args
 
 import pydantic
 import torch
+from torch import Tensor
 
 import cvtgs
 from cvtgs.boxes import Box
@@ -24,7 +26,7 @@ from cvtgs.io import atomic_output
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.locks import hidden_path
 from cvtgs.io.ply import PlyRows, open_rows
-from cvtgs.io.tensors import map_tensors
+from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.mergenet import Checkpoint, Net, load_checkpoint, save_checkpoint
 from cvtgs.outofcore.memory import CELL_ROOM
 from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, write_scan
@@ -38,10 +40,18 @@ FILES_VERSION = 4
 """Number of the layout of these files: raise it with every change, so that no run continues with
 files of another layout."""
 
-STEPS = (
-    "contributions", "sample", "sites", "sums", "parts", "groups", "labels", "merged", "inflated"
-)  # fmt: skip
-"""First words of the names of the tensor files of steps."""
+Step = Literal[
+    "contributions",  # the contributions of the rows of a block to images of the scene
+    "sample",  # the curve order of a block, and the points that Lloyd samples
+    "sites",  # the sites of a block after some iterations of Lloyd
+    "sums",  # the sums of the points of a block per own and remote site
+    "parts",  # the cell of every row, and the moments of the parts of cells
+    "groups",  # the group of every cell of a block, and the block's groups
+    "labels",  # the own group of every row, and the row counts sent to blocks
+    "merged",  # the merged Gaussians of a block
+    "inflated",  # the merged Gaussians after inflation, and the neighbours of each
+]
+"""First word of the name of a tensor file, which one step writes and later ones read."""
 
 
 class Manifest(pydantic.BaseModel):
@@ -108,50 +118,39 @@ class Job:
         """Return the file with the protected rows of one range of the source."""
         return self.path(f"kept_{number:05d}")
 
-    def sample_path(self, block: int) -> Path:
-        """Return the file with the curve order of a block, and the points that Lloyd samples."""
-        return self.path(f"sample_{block:05d}")
+    def step_path(self, step: Step, block: int, iteration: int | None = None) -> Path:
+        """Return the file that a step writes for a block; Lloyd writes one per iteration."""
+        nth = "" if iteration is None else f"_{iteration:02d}"
+        return self.path(f"{step}{nth}_{block:05d}")
+
+    def has(self, step: Step, block: int, iteration: int | None = None) -> bool:
+        """Return whether a step is done for a block."""
+        return self.step_path(step, block, iteration).exists()
+
+    def read(self, step: Step, block: int, iteration: int | None = None) -> dict[str, Tensor]:
+        """Map the tensors that a step wrote for a block."""
+        return map_tensors(self.step_path(step, block, iteration))[0]
+
+    def write(
+        self,
+        step: Step,
+        block: int,
+        tensors: Mapping[str, Tensor],
+        iteration: int | None = None,
+        *,
+        facts: Mapping[str, str] | None = None,
+    ) -> None:
+        """Write the tensors of a step for a block."""
+        save_tensors(self.step_path(step, block, iteration), tensors, facts or {})
 
     @property
     def views_path(self) -> Path:
         """The file of the cameras that all blocks share, and of the sample of the scene."""
         return self.path("views.safetensors")
 
-    def contributions_path(self, block: int) -> Path:
-        """Return the file with the contributions of the rows of a block to images of the scene."""
-        return self.path(f"contributions_{block:05d}")
-
-    def sites_path(self, iteration: int, block: int) -> Path:
-        """Return the file with the sites of a block after some iterations of Lloyd."""
-        return self.path(f"sites_{iteration:02d}_{block:05d}")
-
-    def sums_path(self, iteration: int, block: int) -> Path:
-        """Return the file with the sums of the points of a block per own and remote site."""
-        return self.path(f"sums_{iteration:02d}_{block:05d}")
-
-    def parts_path(self, block: int) -> Path:
-        """Return the file with the cell of every row, and the moments of the parts of cells."""
-        return self.path(f"parts_{block:05d}")
-
-    def groups_path(self, block: int) -> Path:
-        """Return the file with the group of every cell of a block, and the block's groups."""
-        return self.path(f"groups_{block:05d}")
-
-    def labels_path(self, block: int) -> Path:
-        """Return the file with the own group of every row, and the row counts sent to blocks."""
-        return self.path(f"labels_{block:05d}")
-
     def sent_path(self, block: int) -> Path:
         """Return the file with the rows of a block that belong to remote groups."""
         return self.path(f"sent_{block:05d}")
-
-    def merged_path(self, block: int) -> Path:
-        """Return the file with the merged Gaussians of a block."""
-        return self.path(f"merged_{block:05d}")
-
-    def inflated_path(self, block: int) -> Path:
-        """Return the file with the merged Gaussians after inflation, and the neighbours of each."""
-        return self.path(f"inflated_{block:05d}")
 
     def small_path(self, block: int) -> Path:
         """Return the file of a finished block."""
@@ -316,8 +315,8 @@ class Job:
 
     def _remove_damaged(self) -> None:
         """Remove damaged files of steps, so that these steps run again."""
-        for kind in STEPS:
-            for path in self.path("").glob(f"{kind}_*"):
+        for step in get_args(Step):
+            for path in self.path("").glob(f"{step}_*"):
                 try:
                     facts = map_tensors(path)[1]  # Windows does not remove mapped files
                     whole = True

@@ -18,7 +18,6 @@ from cvtgs.cvt import (
 )
 from cvtgs.devices import one_thread
 from cvtgs.grouping import curve_order, embed_rows
-from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.math.segments import label_argmin, sort_by_label
 from cvtgs.outofcore.allocate import cell_parts
 from cvtgs.outofcore.halo import (
@@ -68,16 +67,16 @@ def seed(job: Job, block: int) -> None:
 
     A block without cells gets neither; its Gaussians join cells of other blocks.
     """
-    if job.sites_path(0, block).exists() and job.sample_path(block).exists():
+    if job.has("sites", block, 0) and job.has("sample", block):
         return
     order, points, weights = _embedded_rows(job, block)
     config, count = job.config.cvt, job.cells[block]
     if count == 0:
-        save_tensors(job.sample_path(block), {"order": order}, {})
+        job.write("sample", block, {"order": order})
         return
     seeds = choose_seeds(weights, count, config=config, seed=job.config.seed)
     sample, shares = sample_points(points, weights, config.samples_per_site * count)
-    save_tensors(job.sample_path(block), {"order": order, "points": sample, "weights": shares}, {})
+    job.write("sample", block, {"order": order, "points": sample, "weights": shares})
     _save_sites(job, 0, block, points[seeds].double())
 
 
@@ -86,10 +85,9 @@ def accumulate(job: Job, iteration: int, block: int) -> float:
     """Sum the points of a block per nearest site, own or remote; return their energy."""
     if job.cells[block] == 0:
         return 0.0
-    path = job.sums_path(iteration, block)
-    if path.exists():
-        return float(map_tensors(path)[0]["energy"])
-    tensors, _ = map_tensors(job.sample_path(block))
+    if job.has("sums", block, iteration):
+        return float(job.read("sums", block, iteration)["energy"])
+    tensors = job.read("sample", block)
     points, weights = tensors["points"], tensors["weights"]
     sites, found = _assign(job, iteration, block, points)
     count = len(sites)
@@ -99,7 +97,7 @@ def accumulate(job: Job, iteration: int, block: int) -> float:
     own = {"totals": totals[:count], "sums": sums[:count]}
     others = {"remote": remote, "remote_totals": totals[count:], "remote_sums": sums[count:]}
     facts = {"energy": energy, "spare": torch.tensor(len(points) - count - 1)}
-    save_tensors(path, own | others | facts, {})
+    job.write("sums", block, own | others | facts, iteration)
     return float(energy)
 
 
@@ -109,7 +107,7 @@ def move_sites(job: Job, iteration: int) -> None:
     A site that only has points of other blocks becomes a site of one of these.
     """
     blocks = job.blocks_with_sites()
-    left = [block for block in blocks if not job.sites_path(iteration + 1, block).exists()]
+    left = [block for block in blocks if not job.has("sites", block, iteration + 1)]
     if not left:
         return
     remote = _remote_sums(job, iteration)
@@ -125,7 +123,7 @@ def _remote_sums(job: Job, iteration: int) -> dict[int, RemoteSums]:
     """Read the sums over the points of other blocks, for the sites of each block."""
     blocks, parts = job.blocks_with_sites(), list[tuple[Tensor, ...]]()
     for block in blocks:
-        tensors, _ = map_tensors(job.sums_path(iteration, block))
+        tensors = job.read("sums", block, iteration)
         owners, numbers = tensors["remote"].unbind(1)
         values = (tensors["remote_totals"], tensors["remote_sums"])
         parts.append((owners, numbers, torch.full_like(owners, block), *values))
@@ -137,8 +135,8 @@ def _remote_sums(job: Job, iteration: int) -> dict[int, RemoteSums]:
 
 def _centroids(job: Job, iteration: int, block: int, remote: RemoteSums) -> Tensor:
     """Return the centroids of the sites of a block."""
-    tensors, _ = map_tensors(job.sums_path(iteration, block))
-    sites = map_tensors(job.sites_path(iteration, block))[0]["sites"]
+    tensors = job.read("sums", block, iteration)
+    sites = job.read("sites", block, iteration)["sites"]
     totals = tensors["totals"].index_add(0, remote.numbers, remote.totals)
     sums = tensors["sums"].index_add(0, remote.numbers, remote.sums)
     return centroids(totals, sums, sites)
@@ -155,11 +153,9 @@ def _change_blocks(
     """
     leaving: dict[int, list[int]] = {block: [] for block in remote}
     arriving: dict[int, list[Tensor]] = {block: [] for block in remote}
-    spare = {
-        block: int(map_tensors(job.sums_path(iteration, block))[0]["spare"]) for block in remote
-    }
+    spare = {block: int(job.read("sums", block, iteration)["spare"]) for block in remote}
     for block, sums in remote.items():
-        own = map_tensors(job.sums_path(iteration, block))[0]["totals"]
+        own = job.read("sums", block, iteration)["totals"]
         heaviest = label_argmin(-sums.totals, sums.numbers, len(own))
         lonely = ((own == 0) & (heaviest < len(sums.totals))).nonzero()[: len(own) - 1, 0]
         if len(lonely) == 0:
@@ -180,9 +176,9 @@ def assign(job: Job, iterations: int, block: int) -> None:
 
     Every own site keeps at least one Gaussian of the block, so no cell is empty.
     """
-    if job.parts_path(block).exists():
+    if job.has("parts", block):
         return
-    order = map_tensors(job.sample_path(block))[0]["order"]
+    order = job.read("sample", block)["order"]
     order, points, weights = _embedded_rows(job, block, order)
     sites, found = _assign(job, iterations, block, points)
     found, refilled = _fill_empty(found, points, sites, weights)
@@ -195,7 +191,7 @@ def assign(job: Job, iterations: int, block: int) -> None:
     members = read_apparent_rows(job, block, is_slim=is_slim)
     parts = cell_parts(job, members, owners, labels, len(sites))
     facts = {"energy": energy, "refilled": torch.tensor(refilled)}
-    save_tensors(job.parts_path(block), parts | facts, {})
+    job.write("parts", block, parts | facts)
 
 
 def _embedded_rows(job: Job, block: int, order: Tensor | None = None) -> EmbeddedRows:
@@ -229,13 +225,9 @@ def _assign(job: Job, iteration: int, block: int, points: Tensor) -> tuple[Tenso
     nearest = choose_search(has_duplicates=has_duplicates)
     sites = points[:0].double()
     if job.cells[block]:
-        sites = map_tensors(job.sites_path(iteration, block))[0]["sites"]
-    paths = {
-        other: job.sites_path(iteration, other)
-        for other in job.blocks_with_sites()
-        if other != block
-    }
-    others = other_blocks(paths, name="sites")
+        sites = job.read("sites", block, iteration)["sites"]
+    numbers = [other for other in job.blocks_with_sites() if other != block]
+    others = other_blocks(job, "sites", "sites", numbers, iteration)
     return sites, assign_points(points, sites, others, nearest=nearest)
 
 
@@ -272,5 +264,4 @@ def _fill_empty(
 
 
 def _save_sites(job: Job, iteration: int, block: int, sites: Tensor) -> None:
-    tensors = {"sites": sites, "bounds": bounding_box(sites)}
-    save_tensors(job.sites_path(iteration, block), tensors, {})
+    job.write("sites", block, {"sites": sites, "bounds": bounding_box(sites)}, iteration)

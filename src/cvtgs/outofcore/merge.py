@@ -1,8 +1,6 @@
 """Turn the cells of a block into Gaussians: merge, inflate, correct, with remote neighbours."""
 
 import warnings
-from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -14,10 +12,10 @@ from cvtgs.clock import StageClock
 from cvtgs.devices import one_thread
 from cvtgs.io import atomic_output, save
 from cvtgs.io.axes import SCENE_AXES
-from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
+from cvtgs.io.tensors import add_prefix, under_prefix
 from cvtgs.mergenet import correct_cells
 from cvtgs.outofcore.halo import bounding_box, halo_cells, other_blocks
-from cvtgs.outofcore.job import Job
+from cvtgs.outofcore.job import Job, Step
 from cvtgs.outofcore.rows import analysis_of, read_members, read_rows
 from cvtgs.pipeline import merge_members, neighbor_count, reduce_scene, shape_merged
 from cvtgs.progress import silent
@@ -77,7 +75,7 @@ class WithHalo(NamedTuple):
 @one_thread()
 def merge(job: Job, block: int) -> None:
     """Merge the members of every cell of a block."""
-    if job.merged_path(block).exists():
+    if job.has("merged", block):
         return
     _, scene, _, partition = read_cells(job, block)
     merged, shown = merge_members(scene, partition, job.config.merge, areas=scene.areas)
@@ -88,31 +86,32 @@ def merge(job: Job, block: int) -> None:
         "bounds": bounding_box(merged.means),
     }
     tensors = merged.tensors() | add_prefix(EXTRA, merged.extras) | more
-    save_tensors(job.merged_path(block), tensors, {})
+    job.write("merged", block, tensors)
 
 
 @one_thread()
 def inflate(job: Job, block: int) -> None:
     """Find the neighbours of the cells of a block, align axes and inflate."""
-    path = job.inflated_path(block)
-    if path.exists():
+    if job.has("inflated", block):
         return
-    own, _ = map_tensors(job.merged_path(block))
+    own = job.read("merged", block)
     near = neighbor_count(job.config.merge, with_network=job.has_network)
-    paths = {other: job.merged_path(other) for other in job.blocks_with_cells() if other != block}
-    others = other_blocks(paths, name="means")
+    numbers = [other for other in job.blocks_with_cells() if other != block]
+    others = other_blocks(job, "merged", "means", numbers)
     remote = halo_cells(own["means"], others, count=near)
-    merged, _, own_count = _with_halo(block, remote, job.merged_path)
+    merged, _, own_count = _with_halo(job, "merged", block, remote)
     neighbors = cvt.nearest_neighbors(merged.means, near)[:own_count]
     # Only the number of members per cell matters here, so their rows are left out.
     offsets = torch.nn.functional.pad(own["sizes"].cumsum(0), (1, 0))
     shown = cells.Partition(order=own["sizes"][:0], offsets=offsets)
     inflated = shape_merged(merged, shown, neighbors, job.config.merge)
-    shapes = {
+    found = {
         "quats": inflated.quats[:own_count],
         "log_scales": inflated.log_scales[:own_count],
+        "neighbors": neighbors,
+        "remote": remote,
     }
-    save_tensors(path, own | shapes | {"neighbors": neighbors, "remote": remote}, {})
+    job.write("inflated", block, own | found)
 
 
 @one_thread()
@@ -121,9 +120,9 @@ def correct(job: Job, block: int) -> None:
     if job.small_path(block).exists():
         return
     original, scene, visibility, partition = read_cells(job, block)
-    own, _ = map_tensors(job.inflated_path(block))
+    own = job.read("inflated", block)
     shown = partition.keep_only(own["representatives"])
-    small, sizes, own_count = _with_halo(block, own["remote"], job.inflated_path)
+    small, sizes, own_count = _with_halo(job, "inflated", block, own["remote"])
     net = job.read_network(scene.dtype)
     if net is not None:
         small = correct_cells(
@@ -181,13 +180,13 @@ def read_cells(job: Job, block: int) -> BlockCells:
     return BlockCells(rows.scene, scene, rows.visibility, partition)
 
 
-def _with_halo(block: int, remote: Tensor, path: Callable[[int], Path]) -> WithHalo:
+def _with_halo(job: Job, step: Step, block: int, remote: Tensor) -> WithHalo:
     """Read the merged Gaussians of a block, then the remote ones in the order of their blocks."""
-    own, _ = map_tensors(path(block))
+    own = job.read(step, block)
     names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN", "sizes")
     parts = {name: [own[name]] for name in names}
     for other in torch.unique(remote[:, 0]).tolist():
-        tensors, _ = map_tensors(path(other))
+        tensors = job.read(step, other)
         numbers = remote[remote[:, 0] == other, 1]
         for name, values in parts.items():
             values.append(tensors[name].index_select(0, numbers))

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from cvtgs import analysis
 from cvtgs.io import atomic_output
-from cvtgs.io.tensors import map_tensors
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.scan import CHUNK, SceneScan
 from cvtgs.scene import GaussianScene
@@ -65,7 +64,7 @@ def analysis_of(scan: SceneScan, rows: BlockRows) -> analysis.SceneAnalysis:
 
 def read_members(job: Job, block: int) -> tuple[BlockRows, Tensor]:
     """Read the rows in the cells of a block, and the cell of each."""
-    labels = map_tensors(job.labels_path(block))[0]["labels"].long()
+    labels = job.read("labels", block)["labels"].long()
     stays = labels >= 0
     received = list(_received(job, block))
     cells = [torch.from_numpy(rows[CELL].astype(np.int64)) for rows in received]
@@ -116,7 +115,7 @@ def _received(job: Job, block: int) -> Iterator[NDArray[Any]]:
     for other in job.blocks_with_rows():
         if other == block:
             continue
-        sent = map_tensors(job.labels_path(other))[0]["sent"]
+        sent = job.read("labels", other)["sent"]
         start, count = int(sent[:block].sum()), int(sent[block])
         yield from _mapped(job.sent_path(other), kind, start, count)
 

@@ -22,7 +22,6 @@ from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES, checked_axes
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import PlyRows, join_plys, open_rows
-from cvtgs.io.tensors import map_tensors
 from cvtgs.outofcore.allocate import allocate, join
 from cvtgs.outofcore.improve import improve, join_matchings, join_refinements
 from cvtgs.outofcore.job import Job, Manifest, job_folder, started
@@ -352,7 +351,7 @@ def report_blocks(
             DroppedDataWarning,
         )
     tessellated = job.blocks_with_rows() if job.goes_by_steps else []
-    parts = [map_tensors(job.parts_path(block))[0] for block in tessellated]
+    parts = [job.read("parts", block) for block in tessellated]
     kept_mass = sum(float(job.source.scene(rows).masses.sum()) for rows in kept_rows(job))
     renders = simplifier.config.uses_renders or bool(refinements)
     return SimplifyReport(

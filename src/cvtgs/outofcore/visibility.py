@@ -49,8 +49,7 @@ def write_views(job: Job, sample: GaussianScene, *, total: int) -> None:
 @one_thread()
 def measure(job: Job, block: int) -> None:
     """Write the contributions of the Gaussians of a block, and their sums."""
-    path = job.contributions_path(block)
-    if path.exists():
+    if job.has("contributions", block):
         return
     scan, rows = job.read_scan(), read_rows(job, block, is_slim=True)
     tensors, facts = map_tensors(job.views_path)
@@ -68,14 +67,15 @@ def measure(job: Job, block: int) -> None:
     drawn = drop_mip_tag(concatenate([rows.scene, others]), scan.plan)
     found = contributions(drawn, cameras)[: len(rows.scene)].contiguous()
     mass = (rows.apparent_areas * rows.scene.opacities).double().sum()
-    save_tensors(path, {"contributions": found, "pixels": found.sum(), "mass": mass}, {})
+    tensors = {"contributions": found, "pixels": found.sum(), "mass": mass}
+    job.write("contributions", block, tensors)
 
 
 def add_contributions(job: Job) -> None:
     """Write the sums of masses and contributions over all blocks."""
     sums = {"mass": 0.0, "pixels": 0.0}
     for block in job.blocks_with_rows():
-        tensors, _ = map_tensors(job.contributions_path(block))
+        tensors = job.read("contributions", block)
         sums = {name: total + float(tensors[name]) for name, total in sums.items()}
     with atomic_output(job.path(MEASURED), overwrite=True) as file:
         file.write(json.dumps(sums).encode())
@@ -89,7 +89,7 @@ def read_apparent_rows(job: Job, block: int, *, is_slim: bool = True) -> BlockRo
     measured = measured_areas(
         rows.apparent_areas,
         rows.scene.opacities,
-        map_tensors(job.contributions_path(block))[0]["contributions"],
+        job.read("contributions", block)["contributions"],
         mass_per_pixel=mass_per_pixel,
         share=job.config.visibility.mass_share,
     )
