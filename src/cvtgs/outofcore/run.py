@@ -170,7 +170,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
             if not resumes:
                 with one_thread():
                     job.write_manifest(_scan_and_sort(job, key, workers, clock))
-        energies = _tessellate_and_merge(job, workers, clock) if job.goes_by_steps else ()
+        energies = _group(job, workers, clock) if job.goes_by_steps else ()
         resumed = _run_blocks(job, workers, clock)
         with clock.stage("assemble"):
             assemble_blocks(job, output, axes=output_axes, overwrite=overwrite)
@@ -238,21 +238,22 @@ def _run_blocks(job: Job, workers: Workers, clock: StageClock) -> int:
     """Simplify the unfinished blocks; return how many were already finished."""
     with_cells = job.blocks_with_cells()
     resumed = sum(job.finished_path(block).exists() for block in with_cells)
-    last = correct if job.goes_by_steps else simplify_block
-    with clock.stage("blocks", len(with_cells)) as advance:
-        _run_all(workers, partial(last, job), with_cells, advance)
+    steps: dict[str, Callable[[Job, int], None]] = {"blocks": simplify_block}
+    if job.goes_by_steps:
+        steps = {"merge": merge, "inflate": inflate, "blocks": correct}
     if job.uses_images:
-        with clock.stage("images", len(with_cells)) as advance:
-            _run_all(workers, partial(improve, job), with_cells, advance)
+        steps["images"] = improve
+    for name, step in steps.items():
+        with clock.stage(name, len(with_cells)) as advance:
+            _run_all(workers, partial(step, job), with_cells, advance)
     return resumed
 
 
-def _tessellate_and_merge(job: Job, workers: Workers, clock: StageClock) -> tuple[float, ...]:
-    """Group the Gaussians of all blocks into cells; merge and inflate the cells.
+def _group(job: Job, workers: Workers, clock: StageClock) -> tuple[float, ...]:
+    """Group the Gaussians of all blocks into cells; return the energy before every iteration.
 
     Each step runs for all blocks before the next, so the result has no seams: the sites of Lloyd
     move together, cells merge across block borders, and neighbours come from the whole scene.
-    Returns the energy before every Lloyd iteration.
     """
     blocks, iterations = job.blocks_with_rows(), job.config.cvt.iterations
     if job.config.uses_renders:
@@ -277,10 +278,6 @@ def _tessellate_and_merge(job: Job, workers: Workers, clock: StageClock) -> tupl
     with clock.stage("allocate", len(blocks)) as advance:
         allocate(job)
         _run_all(workers, partial(join, job), blocks, advance)
-    with_cells = job.blocks_with_cells()
-    for name, step in (("merge", merge), ("inflate", inflate)):
-        with clock.stage(name, len(with_cells)) as advance:
-            _run_all(workers, partial(step, job), with_cells, advance)
     return tuple(energies[1:])
 
 
