@@ -36,7 +36,7 @@ SENT_BYTES = "sent_bytes"
 """Entry of the label file of a block: bytes of the file of its sent rows."""
 
 
-FILES_VERSION = 4
+FILES_VERSION = 5
 """Number of the layout of these files: raise it with every change, so that no run continues with
 files of another layout."""
 
@@ -59,7 +59,6 @@ class Manifest(pydantic.BaseModel):
 
     Attributes:
         key: Digest of everything that the result depends on.
-        source: Path of the source.
         total: Number of Gaussians that all blocks keep together.
         cells: Number of cells of the tessellation in each block; their sum is at least ``total``.
         left_out_mass: Mass of the Gaussians that the filter leaves out.
@@ -68,7 +67,6 @@ class Manifest(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
     key: str
-    source: str
     total: int
     cells: tuple[int, ...]
     left_out_mass: float
