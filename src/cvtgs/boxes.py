@@ -142,15 +142,7 @@ def inside(boxes: Sequence[Box], means: Float[Tensor, "n 3"]) -> Bool[Tensor, "n
 
 
 def check_mask(keep: Tensor, count: int) -> None:
-    """Check that a value is a mask of the Gaussians of a scene.
-
-    Args:
-        keep: The mask.
-        count: Number of Gaussians of the scene.
-
-    Raises:
-        InvalidArgumentError: It is no tensor, or has another shape or dtype.
-    """
+    """Raise unless a value is a mask of the ``count`` Gaussians of a scene."""
     if not isinstance(keep, Tensor) or keep.dtype != torch.bool or keep.shape != (count,):
         shape = f"{keep.dtype} {tuple(keep.shape)}" if isinstance(keep, Tensor) else repr(keep)
         raise InvalidArgumentError(

@@ -110,13 +110,7 @@ def connect(address: str) -> "Client":
 
 
 class _Worker(NamedTuple):
-    """The answer of a worker to a check.
-
-    Attributes:
-        versions: Versions of the software that the result depends on.
-        source_bytes: Size of the source as the worker sees it; None if it cannot see it.
-        sees_folder: Whether the worker can read and write the folder of the job.
-    """
+    """What a worker sees: versions, the size of the source (None: no source), and the folder."""
 
     versions: dict[str, str]
     source_bytes: int | None

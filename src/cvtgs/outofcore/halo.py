@@ -86,17 +86,14 @@ def _run_maxima(values: Float[Tensor, "n"]) -> Float[Tensor, "r"]:
 
 
 class Assignment(NamedTuple):
-    """The nearest site of every point, in any block.
+    """Block of every point's nearest site (-1 is the own one), its number there, and its distance.
 
-    Attributes:
-        blocks: ``(n,)`` block of the site; -1 is the point's own block.
-        labels: ``(n,)`` number of the site in its block.
-        squared: ``(n,)`` squared distance to it, in float64.
+    Distances are squared, in float64.
     """
 
-    blocks: Tensor
-    labels: Tensor
-    squared: Tensor
+    blocks: Int[Tensor, "n"]
+    labels: Int[Tensor, "n"]
+    squared: Float[Tensor, "n"]
 
 
 def assign_points(

@@ -49,12 +49,9 @@ LATER_SEED = 307
 
 
 class Drawn(NamedTuple):
-    """The scenes that are rendered while a block is improved.
+    """The scenes that are rendered while a block is improved: its simplified and full Gaussians.
 
-    Attributes:
-        small: The fixed Gaussians, then those of the simplified block.
-        full: The fixed Gaussians, then the members of the cells of the block.
-        fixed: Number of fixed Gaussians: protected ones, and the simplified ones of other blocks.
+    Both begin with ``fixed`` others: protected ones, and the simplified ones of other blocks.
     """
 
     small: GaussianScene
@@ -63,12 +60,7 @@ class Drawn(NamedTuple):
 
 
 class BlockViews(NamedTuple):
-    """The cameras that look at a block.
-
-    Attributes:
-        matching: Those of the images that it is matched to; None if it is not.
-        refinement: Those of the images that it is refined with; None if it is not.
-    """
+    """The cameras that look at a block while it is matched and refined; None if it is not."""
 
     matching: Cameras | None
     refinement: Cameras | None

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.analysis import SceneAnalysis
@@ -32,33 +33,20 @@ from cvtgs.outofcore.visibility import read_apparent_rows
 
 
 class EmbeddedRows(NamedTuple):
-    """The Gaussians of a block, embedded in the space of the tessellation.
+    """Rows of a block along a Morton curve, with positions in the space of the tessellation."""
 
-    Attributes:
-        order: ``(n,)`` row numbers along a Morton curve, int32.
-        points: ``(n, d)`` positions in this order.
-        weights: ``(n,)`` weights in this order.
-    """
-
-    order: Tensor
-    points: Tensor
-    weights: Tensor
+    order: Int[Tensor, "n"]
+    points: Float[Tensor, "n d"]
+    weights: Float[Tensor, "n"]
 
 
 class RemoteSums(NamedTuple):
-    """Sums over the points of other blocks that are nearest to a site of a block.
+    """Number of each site with points of another block, that block, and weight and sum of these."""
 
-    Attributes:
-        numbers: ``(r,)`` number of the site.
-        blocks: ``(r,)`` block of the points.
-        totals: ``(r,)`` their weight.
-        sums: ``(r, d)`` the sum of the weighted points.
-    """
-
-    numbers: Tensor
-    blocks: Tensor
-    totals: Tensor
-    sums: Tensor
+    numbers: Int[Tensor, "r"]
+    blocks: Int[Tensor, "r"]
+    totals: Float[Tensor, "r"]
+    sums: Float[Tensor, "r d"]
 
 
 @one_thread()

@@ -4,6 +4,7 @@ import warnings
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs import cells, cvt, validity
@@ -43,32 +44,19 @@ class BlockReport(CellStatistics):
 
 
 class BlockCells(NamedTuple):
-    """The Gaussians in the cells of a block.
-
-    Attributes:
-        original: The Gaussians with all of their columns.
-        scene: The same with only the columns and SH bands that are used.
-        visibility: ``(n,)`` ambient visibility, 0 to 1.
-        partition: Rows of every cell.
-    """
+    """The Gaussians in the cells of a block; ``scene`` has only the columns that are used."""
 
     original: GaussianScene
     scene: GaussianScene
-    visibility: Tensor
+    visibility: Float[Tensor, "n"]
     partition: cells.Partition
 
 
 class WithHalo(NamedTuple):
-    """The merged Gaussians of a block, followed by those of its halo.
-
-    Attributes:
-        scene: One Gaussian per cell; no extra columns.
-        sizes: ``(m + h,)`` number of members of each cell.
-        own_count: Number of own cells, m.
-    """
+    """The merged Gaussians of a block, then those of its halo, and their numbers of members."""
 
     scene: GaussianScene
-    sizes: Tensor
+    sizes: Int[Tensor, "k"]
     own_count: int
 
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,17 +24,11 @@ MAPPED_ROWS = 1 << 14
 
 
 class BlockRows(NamedTuple):
-    """Gaussians of a block.
-
-    Attributes:
-        scene: The Gaussians.
-        apparent_areas: ``(n,)`` areas as they count in images: smaller if distant or enclosed.
-        visibility: ``(n,)`` ambient visibility, 0 to 1.
-    """
+    """Gaussians of a block, with the areas and the ambient visibility found by the sort."""
 
     scene: GaussianScene
-    apparent_areas: Tensor
-    visibility: Tensor
+    apparent_areas: Float[Tensor, "n"]
+    visibility: Float[Tensor, "n"]
 
 
 def record_type(job: Job, *, with_cell: bool = False) -> np.dtype[Any]:

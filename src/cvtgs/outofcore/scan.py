@@ -119,13 +119,7 @@ MAPPED_ROWS = 1 << 15
 
 
 class RowRange(NamedTuple):
-    """Consecutive rows of the source, which one process reads in one call.
-
-    Attributes:
-        number: Number of the range.
-        start: First row.
-        stop: Row after the last one.
-    """
+    """Rows ``start`` to ``stop`` of the source, which one process reads in one call."""
 
     number: int
     start: int

@@ -41,14 +41,7 @@ from cvtgs.scene import GaussianScene
 
 
 class SortedFile(NamedTuple):
-    """A file that one attempt to sort a range wrote, before the job adopts it.
-
-    Attributes:
-        name: Final name in the folder of the job.
-        attempt: Current name.
-        size: Size in bytes.
-        checksum: CRC-32 of its content.
-    """
+    """A file that one attempt to sort a range wrote: final and current name, bytes and CRC-32."""
 
     name: str
     attempt: str
@@ -180,13 +173,9 @@ def _sort(
 
 
 class SortedCounts(NamedTuple):
-    """The contribution of a range of the source to every block.
+    """The contribution of a range of the source to every block; see :class:`SortedBlocks`.
 
-    Attributes:
-        rows: Number of Gaussians per block.
-        cells: Weight per chunk of rows and block, in cells; a Gaussian counts at most 1.
-        left_out: Mass that the filter leaves out, one entry per chunk that loses any.
-        files: Files of the rows.
+    Weights and masses are those of single chunks of rows.
     """
 
     rows: list[int]

@@ -21,12 +21,7 @@ _UNLIT = Material(lit=False)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
-    """An object in a scene, and its share of the Gaussians.
-
-    Attributes:
-        share: Share of the count, relative to the other parts.
-        draw: Function that makes its Gaussians.
-    """
+    """An object in a scene, and its share of the Gaussians, relative to the other parts."""
 
     share: float
     draw: Draw

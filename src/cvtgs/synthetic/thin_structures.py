@@ -23,13 +23,7 @@ _MANY_BLADES = 12_000  # above this count blades are slimmer, so that the ground
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Strands:
-    """Straight pieces of round rods.
-
-    Attributes:
-        starts: ``(k, 3)`` one end of each.
-        ends: ``(k, 3)`` other end of each.
-        radii: ``(k,)`` radius of each.
-    """
+    """Straight pieces of round rods: their ends and radii."""
 
     starts: Float[Tensor, "k 3"]
     ends: Float[Tensor, "k 3"]
