@@ -195,9 +195,3 @@ def test_bad_arguments_are_refused(arguments, text):
     valid = {"kind": "room", "count": 10, "sh_degree": 0, "seed": 0}
     with pytest.raises(InvalidArgumentError, match=text):
         synthetic.scene(**{**valid, **arguments})
-
-
-@pytest.mark.parametrize("shares", [[], [1.0, 0.0]])
-def test_bad_shares_are_refused(shares):
-    with pytest.raises(InvalidArgumentError, match="shares must be positive"):
-        allocate(3, shares)

@@ -171,7 +171,7 @@ class Job:
     @property
     def goes_by_steps(self) -> bool:
         """Whether each step runs for all blocks before the next; else there is only one step."""
-        return self.blocks > 1 or self.uses_images or self.config.uses_renders
+        return self.blocks > 1 or self.config.uses_images
 
     def report_path(self, block: int) -> Path:
         """Return the file with the report of a finished block."""

@@ -168,9 +168,9 @@ def _room(folder: Path, names: _GroupFiles) -> int | None:
     return limit - max(0, used)
 
 
-def base_bytes(memory: int | None) -> int:
+def base_bytes(memory: int) -> int:
     """Return the bytes of a run without its blocks; with little memory, blocks get a fixed rest."""
-    if memory is None or memory >= ROOMY_BYTES:
+    if memory >= ROOMY_BYTES:
         return BASE_BYTES
     return max(SMALL_BASE_BYTES, memory - (LEAST_BYTES - SMALL_BASE_BYTES))
 

@@ -229,7 +229,7 @@ def scan_range(
         all_masses.append(float(masses.sum()))
         falloff_masses.append(float(seen.sum()))
         valid_count += len(scene)
-        kept_count += int(inside(boxes, scene.means).sum()) if boxes else 0
+        kept_count += int(inside(boxes, scene.means).sum())
     return RangeTotals(
         depths,
         tuple(all_masses),

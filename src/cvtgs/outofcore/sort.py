@@ -187,23 +187,22 @@ class SortedCounts(NamedTuple):
 @one_thread()
 def sort_range(job: Job, rows: RowRange) -> SortedCounts:
     """Write the rows of a range into one file per block, to which no other call writes."""
-    scan, attempt = job.read_scan(), Attempt(job.folder)
+    scan, config, attempt = job.read_scan(), job.config.cvt, Attempt(job.folder)
     row_counts = torch.zeros(job.blocks, dtype=torch.int64)
     cell_counts, left_out = [], []
     for start in range(rows.start, rows.stop, CHUNK):
         records = job.source.read(start, min(start + CHUNK, rows.stop))
         scene = job.source.scene(records)
         valid = validity.valid_rows(scene)
-        protected = valid & inside(job.boxes, scene.means) if job.boxes else ~valid & valid
+        protected = valid & inside(job.boxes, scene.means)
         if bool(protected.any()):
             kept = _kept_rows(records, scene, protected)
             attempt.append(job.kept_path(rows.number).name, kept)
         free = (valid & ~protected).nonzero()[:, 0]
-        chosen, areas, visibility = _filtered(scan, job.config.cvt, scene, free)
+        chosen, areas, visibility = _filtered(scan, config, scene, free)
         if len(chosen) < len(free):
             masses = scene.masses
             left_out.append(float(masses[free].sum() - masses[chosen].sum()))
-        config = job.config.cvt
         weights = cvt.gaussian_weights(scene.opacities[chosen], areas, config.area_power)
         weights = weights.clamp_min(scan.mean_weight * config.weight_floor)
         per_cell = scan.cell_weight

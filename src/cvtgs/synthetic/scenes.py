@@ -127,8 +127,6 @@ def _draw_parts(
 
 def allocate(count: int, shares: Sequence[float]) -> list[int]:
     """Split a count in proportion to positive shares, by largest remainder."""
-    if not shares or min(shares) <= 0:
-        raise InvalidArgumentError(f"shares must be positive numbers, found {list(shares)}.")
     total = sum(shares)
     quotas = [count * share / total for share in shares]
     counts = [int(quota) for quota in quotas]
