@@ -232,18 +232,17 @@ def stream_file(  # noqa: PLR0913 (options by name)
         sample_rows=sample_rows(room),
     )
     form = SogFormat() if kind == "sog" else TilesFormat(transform=transform)
+    choices = repr((form, chunk_gaussians, axes, sh_degree, environment_radii))
+    facts = [job.key(simplifier.checkpoint), targets, choices]
+    key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
     spec = StreamJob(
-        job=job,
+        job=replace(job, folder=job_folder(folder, key)),
         form=form,
         chunk_gaussians=chunk_gaussians,
         axes=axes,
         sh_degree=sh_degree,
         environment_radii=environment_radii,
     )
-    choices = repr((form, chunk_gaussians, axes, sh_degree, environment_radii))
-    facts = [job.key(simplifier.checkpoint), targets, choices]
-    key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
-    spec = replace(spec, job=replace(job, folder=job_folder(folder, key)))
     check_stream(folder, kind, overwrite=overwrite)
     lock = output_lock(Path(spec.job.folder).parent)  # commands lock the output folder
     with lock, without_autocast():

@@ -5,8 +5,7 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -115,11 +114,16 @@ def write_stream(
     """Write a stream of one part; either all files are written or none."""
     place = Path(folder)
     check_stream(place, form.kind, overwrite=overwrite)
-    with _hidden_folder(place) as hidden:
+    hidden = hidden_path(place, "stream")
+    shutil.rmtree(hidden, ignore_errors=True)
+    make_folder(hidden, parents=False)
+    try:
         part = form.write_part(plan, hidden, part=0, listener=listener)
         write_index(form, [part], hidden)
         warn_of_losses([part], place)
         publish(hidden, place, form.kind, overwrite=overwrite)
+    finally:
+        shutil.rmtree(hidden, ignore_errors=True)
     return part.levels
 
 
@@ -198,23 +202,12 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
         return
     index = place / INDEX_NAMES[kind]
     check_output(index, overwrite)
-    if not index.exists() and _has_files(place):
+    # Hidden files do not matter: locks are such.
+    if not index.exists() and any(not path.name.startswith(".") for path in place.iterdir()):
         raise OutputExistsError(
             f"{place}: a stream needs an empty folder, or one with {INDEX_NAMES[kind]} to replace, "
             f"found other files."
         )
-
-
-@contextmanager
-def _hidden_folder(place: Path) -> Iterator[Path]:
-    """Make a temporary hidden folder beside the output folder, or in it if need be."""
-    hidden = hidden_path(place, "stream")
-    shutil.rmtree(hidden, ignore_errors=True)
-    make_folder(hidden, parents=False)
-    try:
-        yield hidden
-    finally:
-        shutil.rmtree(hidden, ignore_errors=True)
 
 
 def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
@@ -267,8 +260,3 @@ def _remove(path: Path) -> None:
 def _refused(place: Path, error: OSError) -> OutputError:
     reason = reason_of(error)
     return OutputError(f"{place}: must be writable for the files of a stream, found: {reason}.")
-
-
-def _has_files(folder: Path) -> bool:
-    """Return whether a folder holds any files except hidden ones, such as locks."""
-    return any(not path.name.startswith(".") for path in folder.iterdir())

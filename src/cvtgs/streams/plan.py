@@ -122,11 +122,8 @@ class StreamPlan(NamedTuple):
         return tuple(sum(map(len, level)) for level in rows)
 
 
-class _Cut(NamedTuple):
-    """A node of the tree over the Gaussians of the coarsest level, without its box."""
-
-    chunk: int | None = None
-    sides: tuple["_Cut", ...] = ()
+_Cut = int | tuple["_Cut", "_Cut"]
+"""A node of the tree over the Gaussians of the coarsest level: a chunk, or both sides of a cut."""
 
 
 @on_host()
@@ -259,12 +256,12 @@ def _cut(
         if int(weights[rows].sum()) <= most or len(rows) == 1:
             labels[rows] = count
             count += 1
-            return _Cut(chunk=count - 1)
+            return count - 1
         order = rows[torch.sort(_widest(means[rows]), stable=True).indices]
         passed = weights[order].cumsum(0)
         half = int(torch.searchsorted(passed, int(passed[-1]) // 2))
         half = min(max(half, 1), len(rows) - 1)
-        return _Cut(sides=(part(order[:half]), part(order[half:])))
+        return part(order[:half]), part(order[half:])
 
     return part(near), count
 
@@ -302,10 +299,9 @@ def _chunk(levels: Sequence[StreamedLevel], rows: tuple[Int[Tensor, "k"], ...]) 
 
 
 def _node(cut: _Cut, chunks: Sequence[StreamChunk]) -> StreamNode:
-    if cut.chunk is not None:
-        chunk = chunks[cut.chunk]
-        return StreamNode(chunk.box_min, chunk.box_max, chunk=cut.chunk)
-    sides = tuple(_node(side, chunks) for side in cut.sides)
+    if isinstance(cut, int):
+        return StreamNode(chunks[cut].box_min, chunks[cut].box_max, chunk=cut)
+    sides = tuple(_node(side, chunks) for side in cut)
     return StreamNode(*join_boxes((side.box_min, side.box_max) for side in sides), sides)
 
 

@@ -190,20 +190,13 @@ def geo_transform(longitude: float, latitude: float, height: float = 0.0) -> tup
     sin_north, cos_north = math.sin(north), math.cos(north)
     squared = FLATTENING * (2.0 - FLATTENING)
     across = EARTH_RADIUS / math.sqrt(1.0 - squared * sin_north**2)
-    columns = (
-        (-sin_east, cos_east, 0.0),
-        (-sin_north * cos_east, -sin_north * sin_east, cos_north),
-        (cos_north * cos_east, cos_north * sin_east, sin_north),
-        (
-            (across + height) * cos_north * cos_east,
-            (across + height) * cos_north * sin_east,
-            (across * (1.0 - squared) + height) * sin_north,
-        ),
-    )
-    last = (0.0, 0.0, 0.0, 1.0)
-    return tuple(
-        number for column, end in zip(columns, last, strict=True) for number in (*column, end)
-    )
+    return (
+        -sin_east, cos_east, 0.0, 0.0,
+        -sin_north * cos_east, -sin_north * sin_east, cos_north, 0.0,
+        cos_north * cos_east, cos_north * sin_east, sin_north, 0.0,
+        (across + height) * cos_north * cos_east, (across + height) * cos_north * sin_east,
+        (across * (1.0 - squared) + height) * sin_north, 1.0,
+    )  # fmt: skip
 
 
 def check_transform(numbers: Sequence[float]) -> tuple[float, ...]:
