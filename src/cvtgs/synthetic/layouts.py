@@ -1,9 +1,7 @@
 """The objects in a scene of each kind, and their positions."""
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import torch
 from jaxtyping import Float
@@ -191,16 +189,14 @@ def courtyard(rng: Random) -> list[Part]:
     ]
 
 
-LAYOUTS: Mapping[str, Callable[[Random], list[Part]]] = MappingProxyType(
-    {
-        "object": single_object,
-        "room": room,
-        "landscape": landscape,
-        "haze": hazy,
-        "thin": thin,
-        "courtyard": courtyard,
-    }
-)
+LAYOUTS = {
+    "object": single_object,
+    "room": room,
+    "landscape": landscape,
+    "haze": hazy,
+    "thin": thin,
+    "courtyard": courtyard,
+}
 """Layout function of every kind of scene."""
 
 

@@ -65,20 +65,10 @@ def placed(
     tilt: float = 0.0,
 ) -> Surface:
     """Tilt a surface about x, turn it about the vertical, and put it at x, z above the ground."""
-    turned = torch.tensor(
-        [
-            [math.cos(turn), 0.0, math.sin(turn)],
-            [0.0, 1.0, 0.0],
-            [-math.sin(turn), 0.0, math.cos(turn)],
-        ]
-    )
-    tilted = torch.tensor(
-        [
-            [1.0, 0.0, 0.0],
-            [0.0, math.cos(tilt), -math.sin(tilt)],
-            [0.0, math.sin(tilt), math.cos(tilt)],
-        ]
-    )
+    cos, sin = math.cos(turn), math.sin(turn)
+    turned = torch.tensor([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
+    cos, sin = math.cos(tilt), math.sin(tilt)
+    tilted = torch.tensor([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
     rotation = turned @ tilted
     offset = torch.tensor([position[0], -height, position[1]])
 
