@@ -28,9 +28,12 @@ AUTOMATIC_VIEWS = 8
 _MOST_VIEWS = 10_000
 
 
-def add_view_options(parser: argparse.ArgumentParser, *, size: int) -> None:
-    """Add the options of cameras and images; ``size`` is the default of ``--size``."""
-    add_options(parser, "--cameras", "--split", "--views")
+def add_view_options(parser: argparse.ArgumentParser, *, size: int, **helps: str) -> None:
+    """Add the options of cameras and images.
+
+    ``size`` is the default of ``--size``; ``helps`` is as in :func:`add_options`.
+    """
+    add_options(parser, "--cameras", "--split", "--views", **helps)
     parser.add_argument(
         "--size",
         type=longer_side,

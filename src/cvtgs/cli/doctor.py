@@ -63,7 +63,7 @@ def add_doctor(add_parser: AddParser) -> None:
         "doctor",
         help="check what works on this machine",
         description="Show which devices and backends work on this machine, and time a small run "
-        "on a generated scene. Ends with 0 if the default path works, else with 1.",
+        "on a generated scene. The exit status is 0 if this run works, else 1.",
     )
     parser.set_defaults(run=doctor)
     parser.add_argument(

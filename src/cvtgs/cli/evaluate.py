@@ -18,7 +18,7 @@ from cvtgs.cli.cameras import (
 )
 from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
 from cvtgs.cli.jobs import expanded
-from cvtgs.cli.options import AddParser, add_options, read_ratios, read_words
+from cvtgs.cli.options import CAMERA_FILES, AddParser, add_options, read_ratios, read_words
 from cvtgs.cli.view import PAGE, check_page, write_page
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import windows_fault
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from cvtgs.tradeoff import Tradeoff
 
 MOST_CAMERAS = 8
-"""Maximum number of cameras that a page shows unless ``--views`` is given."""
+"""Maximum number of cameras that a page shows, and that ``tradeoff`` scores from, by default."""
 
 SCORED_SIZE = 640
 """Longer side of scored images, pixels; shared so that all commands print the same scores."""
@@ -260,10 +260,9 @@ def add_tradeoff(add_parser: AddParser) -> None:
         help="run all presets on a scene and show quality against time",
         description="Simplify IN with every preset, each run in its own process, score the results "
         "against IN, print a table, and write tradeoff.csv, tradeoff.json, tradeoff.png (needs the "
-        "extra plots) and index.html, a single file that works offline. At most "
-        f"{MOST_CAMERAS} of the --cameras are used, unless --views sets another number. If the "
-        "cameras beside IN have a test split (every eighth, for example), it scores, and presets "
-        "that use images are fitted to the others.",
+        "extra plots) and index.html, a single file that works offline. If the cameras beside IN "
+        "have a test split (every eighth, for example), scores are from this split, and presets "
+        "that use images are fitted to the other cameras.",
     )
     parser.set_defaults(run=tradeoff)
     add_options(parser, "input", "--rho")
@@ -273,7 +272,16 @@ def add_tradeoff(add_parser: AddParser) -> None:
         "--save", action="store_true", help="also write the simplified scenes to DIR"
     )
     add_options(parser, "--lpips", "--images", "--trust-sizes", "--overwrite")
-    add_view_options(parser, size=SCORED_SIZE)
+    add_view_options(
+        parser,
+        size=SCORED_SIZE,
+        cameras=f"cameras to score from: {CAMERA_FILES} (default: those beside IN or in its "
+        "folder, if they show the scene, else automatic views); presets that use images are not "
+        "fitted to --cameras",
+        split="split of --cameras to score from (default: all of --cameras)",
+        views=f"number of views to score from (default {MOST_CAMERAS}); they are spread evenly "
+        "over the cameras, all of which are used if there are fewer",
+    )
 
 
 def tradeoff(options: argparse.Namespace) -> None:

@@ -64,7 +64,14 @@ def add_levels(add_parser: AddParser) -> None:
         "--no-scores", action="store_true", help="skip rendering and scoring the levels"
     )
     add_options(parser, "--viewer", "--trust-sizes", "--overwrite")
-    add_view_options(parser, size=400)
+    add_view_options(
+        parser,
+        size=400,
+        split="split of --cameras to score from (default: all of --cameras); if it is given, "
+        "presets that use images are fitted to the split train",
+        views="number of views to score from; with --cameras, N of them, spread evenly (default "
+        "8, or all of --cameras)",
+    )
 
 
 def levels(options: argparse.Namespace) -> None:

@@ -190,10 +190,12 @@ AddParser = Callable[..., CommandParser]
 """Type of the ``add_parser`` method of argparse, which makes the parser of one command."""
 
 
-def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Add shared options to a command."""
+def add_options(parser: argparse.ArgumentParser, *names: str, **helps: str) -> None:
+    """Add shared options to a command; ``helps`` has other help texts for some, by bare name."""
     for name in names:
-        parser.add_argument(*name.split("/"), **_SHARED[name])
+        bare = name.lstrip("-")
+        texts = {"help": helps[bare]} if bare in helps else {}
+        parser.add_argument(*name.split("/"), **{**_SHARED[name], **texts})
 
 
 def read_words(text: str) -> list[str]:

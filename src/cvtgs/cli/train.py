@@ -20,7 +20,7 @@ def add_train(add_parser: AddParser) -> None:
     """Add the command and its options."""
     parser = add_parser(
         "train",
-        help="train the network that merges Gaussians",
+        help="train a network that corrects merged Gaussians",
         description="Train a MergeNet with the configuration CONFIG.toml. Writes the network "
         "to NAME.safetensors, and its curves and the state to resume from beside it.",
     )
@@ -58,7 +58,11 @@ def add_train(add_parser: AddParser) -> None:
         metavar="DIR",
         help="directory of prepared scenes (default: NAME.cache)",
     )
-    parser.add_argument("--resume", action="store_true", help="resume an interrupted training")
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="resume an interrupted training, or extend a finished one (restart_step)",
+    )
     add_options(parser, "--device", "--overwrite", "--quiet")
 
 
