@@ -1,9 +1,10 @@
 """The paper's ablation table, for both configurations: the gain of each part of CVT-GS.
 
-``python -m benchmarks.ablation -o docs`` omits one part at a time of ``paper`` and of ``standard``,
-each with its network, and prints PSNR, SSIM and LPIPS against the full scene as Markdown. The
-folder gets this table and a chart of the means, updated after every scene. Scenes and scorers are
-chosen as in ``benchmarks.quality``: name files, give ``--lpips WEIGHTS`` or ``--scorer COMMAND``.
+``python -m benchmarks.ablation -o FOLDER`` omits one part at a time of ``paper`` and of
+``standard``, each with its network, and prints PSNR, SSIM and LPIPS against the full scene as
+Markdown. The folder gets this table and a chart of the means, updated after every scene. Scenes and
+scorers are chosen as in ``benchmarks.quality``: name files, give ``--lpips WEIGHTS`` or ``--scorer
+COMMAND``.
 
 - w/o CVT: k-NN groups instead of the tessellation; filter, merge, inflation and network stay.
 - w/o filter: every valid Gaussian enters the tessellation.

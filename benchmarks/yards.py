@@ -1,10 +1,10 @@
 """Generate yards that resemble trained unbounded captures, to train and evaluate networks.
 
 ``python -m benchmarks.yards FOLDER`` writes the yards of ``recipes/standard.toml`` (``yard11`` to
-``yard20``; the shipped ``standard`` has seen those up to ``yard16``) and those with which its gate
-was found (``yard1`` to ``yard3``), each with its cameras. Gaussians are dense in the middle and
-grow with the distance. About 4 % of them form a shell of huge, faint Gaussians 40 to 250 units
-away, and some are floaters.
+``yard20``; the shipped ``standard`` was trained on those up to ``yard16``) and three for evaluation
+(``yard1`` to ``yard3``), each with its cameras. Gaussians are dense in the middle and grow with the
+distance. About 4 % of them form a shell of huge, faint Gaussians 40 to 250 units away, and some are
+floaters.
 """
 
 import argparse

@@ -2,7 +2,8 @@
 
 python examples/train_tiny.py tiny.safetensors --steps 20
 
-Such a short training learns nothing useful; the shipped network is made by recipes/standard.toml.
+Such a short training learns nothing useful; recipes/standard.toml makes a network as good as the
+shipped one.
 """
 
 import argparse

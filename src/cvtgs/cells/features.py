@@ -200,8 +200,8 @@ def describe_members(
     weights = masses / _sum(masses, offsets).index_select(0, ids)
     if len(rows) < len(part.order):
         # Estimates that agree with known totals are calibrated (Deville and Sarndal 1992): the mean
-        # of a sample becomes that of all members, the centre of the cell. Otherwise, the chance of
-        # the sample would move, turn and shade the cell.
+        # of a sample becomes that of all members, the centre of the cell. Otherwise the choice of
+        # the sample would move, turn and recolour the cell.
         means = _sum(weights[:, None] * relative.positions, offsets)
         means = torch.where((sampled.counts > offsets.diff())[:, None], means, 0.0)
         positions = relative.positions - means.index_select(0, ids)

@@ -112,15 +112,15 @@ class AllocationConfig(Section):
             of cells merge, cheapest first. 1 keeps the cells of the tessellation.
         neighbors: Number of nearest cells that a cell may merge with.
         color: Weight of the squared colour distance relative to the cost of shape and position,
-            at one cell per Gaussian and a contrast of 0.2 between neighbouring cells, the root of
-            half the mean squared distance of their colours. It is in inverse proportion to the
-            contrast, between 0.06 and 0.28.
+            at one cell per Gaussian and a contrast of 0.2. The contrast is the root of half the
+            mean squared colour distance of neighbouring cells, limited to 0.06 to 0.28; the weight
+            is in inverse proportion to it.
         color_power: This weight is proportional to the ratio of cells to Gaussians to this power;
             colours differ anyway within large cells.
         view_color: Weight of view-dependent colours in this distance, as far as neighbours have
             them in common (:func:`cvtgs.cells.view_components`); 0 leaves them out.
-        mass_power: The cost of a pair is multiplied by its apparent mass to this power, also at
-            a contrast of 0.2. It is in proportion to the contrast, within the same limits.
+        mass_power: The cost of a pair is multiplied by its apparent mass to this power, at a
+            contrast of 0.2; the power is in proportion to the contrast.
         far_relief: This power is reduced by this share where all mass lies beyond three robust
             radii, and in proportion where some does: layers of far Gaussians hide one another, so
             they show less than their mass. Below one cell per ten Gaussians, the share is in
@@ -220,7 +220,8 @@ class MergeConfig(Section):
             ends.
         network: Whether MergeNet corrects the merged Gaussians.
         image_size: Longer side of the images in which the scene will be seen, pixels, for the
-            network: small images widen small Gaussians. Trained on images of 256 and 600.
+            network: small images widen small Gaussians. The shipped network was trained on images
+            of 256 and 600 pixels.
     """
 
     area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)
