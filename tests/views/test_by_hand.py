@@ -11,9 +11,8 @@ import torch
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.math.frames import RobustFrame
 from cvtgs.views import CameraPositions, automatic, layout, mixed, positions, scoring, up
-from cvtgs.views.automatic import CandidateCameras
 from cvtgs.views.layout import SceneLayout
-from cvtgs.views.scoring import CameraScores, SplatSizes
+from cvtgs.views.scoring import SplatSizes
 from cvtgs.views.up import Voxels
 from scenes import random_scene
 
@@ -39,20 +38,21 @@ def test_cameras_around_a_scene_rise_by_the_elevation_and_show_all_of_it():
     )
     away = 2 / math.sin(math.radians(22.5))
     for number, lift, factor in ((0, 0, 1.0), (1, 12, 1.0), (4, 8, 0.75), (11, 50, 1.5)):
-        offsets = found.rounds[number].centers.double() - CENTER
+        cameras, distances = found[number]
+        offsets = cameras.centers.double() - CENTER
         lengths = torch.linalg.vector_norm(offsets, dim=1)
         assert lengths.tolist() == pytest.approx([factor * away] * 4)
-        assert found.distances[number].tolist() == pytest.approx([factor * away] * 4)
+        assert distances.tolist() == pytest.approx([factor * away] * 4)
         rises = torch.rad2deg(torch.asin(offsets @ UP / lengths))
         wanted = [min(80, elevation + lift) for elevation in (20, 35, 12, 28)]
         assert rises.tolist() == pytest.approx(wanted)
-        ahead = found.rounds[number].viewmats[:, 2, :3].double()
+        ahead = cameras.viewmats[:, 2, :3].double()
         torch.testing.assert_close(ahead, -offsets / lengths[:, None], atol=1e-6, rtol=0)
 
 
 def test_cameras_in_a_room_look_down_a_little():
     found = automatic.inside_candidates(layout_of(), CENTER, 3, size=(64, 48), turn=0.25)
-    for cameras in found.rounds:
+    for cameras, _ in found:
         falls = torch.rad2deg(torch.asin(cameras.viewmats[:, 2, :3].double() @ UP))
         assert falls.tolist() == pytest.approx([-10.0] * 3)
 
@@ -81,16 +81,12 @@ def test_the_first_good_camera_is_taken_or_else_that_of_least_penalty(
 ):
     def scored(_, cameras, **__):
         (number,) = cameras.centers[:, 0].round().long().tolist()
-        return CameraScores(
-            good=torch.tensor([bool(good[number])]),
-            penalties=torch.tensor([penalties[number]]).double(),
-        )
+        return torch.tensor([bool(good[number])]), torch.tensor([penalties[number]]).double()
 
     monkeypatch.setattr(automatic, "score_cameras", scored)
     every = SimpleNamespace(layout=None, admit=lambda eyes: torch.ones(len(eyes)).bool())
-    rounds = tuple(cameras_on_a_line([float(number)]) for number in range(4))
-    candidates = CandidateCameras(inside=False, rounds=rounds, distances=(torch.ones(1),) * 4)
-    found = vars(automatic)["_best"](every, [candidates])
+    rounds = [(cameras_on_a_line([float(number)]), torch.ones(1)) for number in range(4)]
+    found = vars(automatic)["_best"](every, rounds)
     assert found.centers[0, 0].item() == best
 
 
@@ -192,8 +188,7 @@ def test_what_is_much_nearer_than_the_subject_is_an_obstacle(subject, least, mos
     )
     eyes, distances = torch.tensor([[2.0, 0, 0]]).double(), torch.tensor([subject])
     cameras = scoring.cameras_at(eyes, -eyes, UP, size=(32, 32), field=45.0)
-    found = scoring.score_cameras(
-        layout_of(sample=ball), cameras, distances=distances, inside=False
-    )
-    assert bool(found.good) is (most == 0)
-    assert least <= float(found.penalties) <= most
+    place = layout_of(sample=ball, room=None)
+    good, penalties = scoring.score_cameras(place, cameras, distances=distances)
+    assert bool(good) is (most == 0)
+    assert least <= float(penalties) <= most

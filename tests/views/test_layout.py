@@ -162,7 +162,7 @@ def test_alternates_around_a_scene_are_not_near(room, least):
     place = SimpleNamespace(layout=layout_of(room=room), near=near)
     found = automatic.found_candidates(place, 2, size=(8, 8), seed=5)
     assert reaches == [((least, 3.0), 5), ((least, 3.0), 6)]
-    assert [len(cameras) for cameras in found.rounds] == [2, 2]
+    assert [len(cameras) for cameras, _ in found] == [2, 2]
 
 
 def test_random_views_aim_at_an_eighth_of_a_radius_around_the_middle():

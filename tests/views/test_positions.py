@@ -310,10 +310,10 @@ def test_cameras_in_a_room_stand_back_by_a_share_of_the_way_to_the_wall_behind(r
         up=up,
     )
     found = inside_candidates(layout, torch.zeros(3).double(), 4, size=(64, 64), turn=0.0)
-    cameras = found.rounds[0]
+    cameras, distances = found[0]
     ahead = cameras.viewmats[:, 2, :3].double() @ right
     for side, wall in ((1.0, 0.5), (-1.0, 1.4)):
         (row,) = (side * ahead > 0.9).nonzero()[:, 0].tolist()
         back = 0.65 * wall * radius
         assert cameras.centers[row].tolist() == pytest.approx([-back * side, 0, 0], abs=1e-6)
-        assert float(found.distances[0][row]) == pytest.approx(back + 0.5 * radius)
+        assert float(distances[row]) == pytest.approx(back + 0.5 * radius)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -62,30 +62,20 @@ _FARTHEST = 1.5
 _FOUND = 2
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CandidateCameras:
-    """Cameras in rounds: first the preferred camera of every view, then its alternates.
-
-    Attributes:
-        inside: Whether the cameras are inside a room.
-        rounds: Cameras of each round, one per view.
-        distances: Distance from each camera to its subject, scene units, one tensor per round.
-    """
-
-    inside: bool
-    rounds: tuple[Cameras, ...]
-    distances: tuple[Float[Tensor, "c"], ...]
+Round = tuple[Cameras, Float[Tensor, "c"]]
+"""A camera for every view and its distance to its subject; the first round has the preferred ones,
+later ones have alternates."""
 
 
 def outside_candidates(
     layout: SceneLayout, count: int, *, size: tuple[int, int], turn: float
-) -> CandidateCameras:
+) -> list[Round]:
     """Return cameras around the scene at several elevations, looking at its middle."""
     right, ahead = level_axes(layout.up)
     shown = layout.radius * (_OBJECT_RADIUS if layout.bounded else _PLACE_RADIUS)
     distance = shown / math.sin(math.radians(0.5 * OUTSIDE_FIELD))
     elevations = [_ELEVATIONS[slot % len(_ELEVATIONS)] for slot in range(count)]
-    rounds, distances = [], []
+    rounds = []
     for shift, lift, factor in _OUTSIDE:
         eyes = []
         for slot, elevation in enumerate(elevations):
@@ -94,17 +84,16 @@ def outside_candidates(
             level = math.cos(angle) * right + math.sin(angle) * ahead
             eyes.append(math.cos(rise) * level + math.sin(rise) * layout.up)
         directions = torch.stack(eyes)
-        rounds.append(
-            cameras_at(
-                layout.center + distance * factor * directions,
-                -directions,
-                layout.up,
-                size=size,
-                field=OUTSIDE_FIELD,
-            )
+        cameras = cameras_at(
+            layout.center + distance * factor * directions,
+            -directions,
+            layout.up,
+            size=size,
+            field=OUTSIDE_FIELD,
         )
-        distances.append(torch.full((count,), distance * factor, dtype=torch.float32, device="cpu"))
-    return CandidateCameras(inside=False, rounds=tuple(rounds), distances=tuple(distances))
+        distances = torch.full((count,), distance * factor, dtype=torch.float32, device="cpu")
+        rounds.append((cameras, distances))
+    return rounds
 
 
 def inside_candidates(
@@ -114,41 +103,37 @@ def inside_candidates(
     *,
     size: tuple[int, int],
     turn: float,
-) -> CandidateCameras:
+) -> list[Round]:
     """Return cameras in a room, moved back from its middle and looking across it."""
     right, ahead = level_axes(layout.up)
     pitch = math.radians(_INSIDE_PITCH)
-    rounds, distances = [], []
+    rounds = []
     for shift, back, lift in _INSIDE:
         angles = [2 * math.pi * (slot + turn + shift) / count for slot in range(count)]
         level = torch.stack([math.cos(angle) * right + math.sin(angle) * ahead for angle in angles])
         steps = back * _distances_to_walls(layout, middle, -level)
         eyes = middle - steps[:, None] * level + lift * layout.height * layout.up
         directions = math.cos(pitch) * level + math.sin(pitch) * layout.up
-        rounds.append(cameras_at(eyes, directions, layout.up, size=size, field=INSIDE_FIELD))
-        distances.append(steps + 0.5 * layout.frame.radius)
-    return CandidateCameras(inside=True, rounds=tuple(rounds), distances=tuple(distances))
+        cameras = cameras_at(eyes, directions, layout.up, size=size, field=INSIDE_FIELD)
+        rounds.append((cameras, steps + 0.5 * layout.frame.radius))
+    return rounds
 
 
 def found_candidates(
     positions: CameraPositions, count: int, *, size: tuple[int, int], seed: int
-) -> CandidateCameras:
+) -> list[Round]:
     """Return cameras at known good positions, as alternates to the other candidates."""
     layout = positions.layout
-    inside = layout.room is not None
-    reach = REACH if inside else (1.4, REACH[1])
-    eyes = torch.cat([positions.near(count, reach, seed + turn) for turn in range(_FOUND)])
-    directions = layout.center - eyes if layout.room is None else layout.room - eyes
-    cameras = cameras_at(
-        eyes, directions, layout.up, size=size, field=INSIDE_FIELD if inside else OUTSIDE_FIELD
-    )
-    rows = torch.arange(len(eyes), device="cpu").split(int(count))  # torch takes no numpy.int64
-    distances = torch.linalg.vector_norm(directions, dim=1)
-    return CandidateCameras(
-        inside=inside,
-        rounds=tuple(cameras.select(part) for part in rows),
-        distances=tuple(distances[part] for part in rows),
-    )
+    reach, field = (1.4, REACH[1]), OUTSIDE_FIELD
+    if layout.room is not None:
+        reach, field = REACH, INSIDE_FIELD
+    rounds = []
+    for turn in range(_FOUND):
+        eyes = positions.near(count, reach, seed + turn)
+        directions = layout.subject - eyes
+        cameras = cameras_at(eyes, directions, layout.up, size=size, field=field)
+        rounds.append((cameras, torch.linalg.vector_norm(directions, dim=1)))
+    return rounds
 
 
 def _distances_to_walls(
@@ -217,40 +202,36 @@ def automatic_views(
     size, turn = (width, height), 0.5 + seed * _GOLDEN
     with one_thread():
         positions = as_positions(scene)
-        candidates = choose_candidates(positions.layout, count, size=size, turn=turn)
-        others = found_candidates(positions, count, size=size, seed=seed)
-        cameras = _best(positions, [candidates, others])
+        rounds = choose_candidates(positions.layout, count, size=size, turn=turn)
+        rounds += found_candidates(positions, count, size=size, seed=seed)
+        cameras = _best(positions, rounds)
     return replace(cameras, names=cameras.view_names)
 
 
 def choose_candidates(
     layout: SceneLayout, count: int, *, size: tuple[int, int], turn: float
-) -> CandidateCameras:
+) -> list[Round]:
     """Return candidates inside the scene if it is a room, else around it."""
     if layout.room is None:
         return outside_candidates(layout, count, size=size, turn=turn)
     return inside_candidates(layout, layout.room, count, size=size, turn=turn)
 
 
-def _best(positions: CameraPositions, candidates: Sequence[CandidateCameras]) -> Cameras:
+def _best(positions: CameraPositions, rounds: Sequence[Round]) -> Cameras:
     """Return the first good candidate of every view, or else that of lowest penalty."""
-    first = candidates[0].rounds[0]
+    first = rounds[0][0]
     viewmats = first.viewmats.clone()
     waiting = torch.arange(len(first), device="cpu")
     least = torch.full((len(first),), math.inf, dtype=torch.float64, device="cpu")
-    rounds = [pair for each in candidates for pair in zip(each.rounds, each.distances, strict=True)]
     for cameras, distances in rounds:
         rows = waiting[positions.admit(cameras.centers[waiting])]
         if len(rows) == 0:
             continue
-        scores = score_cameras(
-            positions.layout,
-            cameras.select(rows),
-            distances=distances[rows],
-            inside=candidates[0].inside,
+        good, penalties = score_cameras(
+            positions.layout, cameras.select(rows), distances=distances[rows]
         )
-        better = scores.good | (scores.penalties < least[rows])
+        better = good | (penalties < least[rows])
         viewmats[rows[better]] = cameras.viewmats[rows[better]]
-        least[rows] = torch.minimum(least[rows], scores.penalties)
-        waiting = waiting[~torch.isin(waiting, rows[scores.good])]
+        least[rows] = torch.minimum(least[rows], penalties)
+        waiting = waiting[~torch.isin(waiting, rows[good])]
     return replace(first, viewmats=viewmats)

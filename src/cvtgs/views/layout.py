@@ -209,6 +209,11 @@ class SceneLayout:
     room: Float[Tensor, "3"] | None
 
     @property
+    def subject(self) -> Float[Tensor, "3"]:
+        """The point that views show: the eye point of a room, else the middle of the content."""
+        return self.center if self.room is None else self.room
+
+    @property
     def is_open(self) -> bool:
         """Whether people who see the scene stand in it, and look far: a garden, not an object."""
         return not self.bounded and self.room is None
@@ -297,12 +302,7 @@ def _far_directions(
 def covering_sample(scene: GaussianScene, count: int) -> tuple[GaussianScene, Float[Tensor, "k 1"]]:
     """Return the heaviest Gaussians and every k-th other, enlarged to cover for omitted ones.
 
-    Args:
-        scene: The scene; only valid rows.
-        count: Largest number of Gaussians of the sample.
-
-    Returns:
-        The scene or a sample of it, SH degree 0, on the CPU; and how much was added to log scales.
+    The sample has SH degree 0 and is on the CPU; also return what was added to its log scales.
     """
     plain = scene.with_tensors({"shN": scene.shN[:, :0]}, {})
     enlargement = torch.zeros(len(scene), 1, dtype=scene.dtype, device=scene.device)

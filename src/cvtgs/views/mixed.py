@@ -108,9 +108,8 @@ def _targets(
     center, radius = layout.frame.center, layout.frame.radius
     generator = torch.Generator().manual_seed(seed + 1)
     if layout.room is None:
-        return center + _AIM * radius * (
-            torch.rand(len(eyes), 3, generator=generator, dtype=torch.float32, device="cpu") - 0.5
-        )
+        draws = torch.rand(len(eyes), 3, generator=generator, dtype=torch.float32, device="cpu")
+        return center + _AIM * radius * (draws - 0.5)
     points = center + radius * layout.voxels.points
     far = torch.cdist(eyes, points) > _LEAST_AIM * radius
     order = torch.rand(far.shape, generator=generator, dtype=torch.float32, device="cpu") * far

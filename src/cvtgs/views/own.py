@@ -20,7 +20,6 @@ _LEAST_LOOKING = 0.5
 _MOST_POINTS = 2000
 _VISIBLE = 0.1
 
-
 _LEAST_TEST = 4
 """A test split of fewer cameras is not used: their mean would tell little."""
 

@@ -144,12 +144,8 @@ class CameraPositions:
         within = (beyond <= beyond.amin()).nonzero()[:, 0]
         picked = within[torch.randint(len(within), (count,), generator=generator, device="cpu")]
         eyes = self.eyes[picked]
-        shifts = (
-            0.1
-            * self.layout.frame.radius
-            * (torch.rand(count, 3, generator=generator, dtype=torch.float32, device="cpu") - 0.5)
-        )
-        moved = eyes + shifts
+        draws = torch.rand(count, 3, generator=generator, dtype=torch.float32, device="cpu")
+        moved = eyes + 0.1 * self.layout.frame.radius * (draws - 0.5)
         return torch.where(self.admit(moved)[:, None], moved, eyes)
 
 
@@ -255,7 +251,7 @@ def stand_free(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, 
         free &= eyes @ layout.up >= layout.floor + _ABOVE * radius
     if len(points) == 0:
         return free
-    local = (eyes - layout.frame.center) / radius
+    local = layout.frame.normalize(eyes)
     free &= torch.cdist(local, points).amin(dim=1) >= FREE
     for row in free.nonzero()[:, 0].tolist():
         above = enclosure(local[row], points, layout.up)
@@ -303,7 +299,7 @@ def _sides(
     layout: SceneLayout, eyes: Float[Tensor, "c 3"]
 ) -> tuple[Int[Tensor, "c"], Bool[Tensor, "c"]]:
     """Return the side that each position faces, and whether the position is outside."""
-    offsets = (eyes - layout.frame.center) / layout.frame.radius
+    offsets = layout.frame.normalize(eyes)
     is_outside = torch.linalg.vector_norm(offsets, dim=1) >= _OUTSIDE
     return (offsets @ _side_directions().T).argmax(dim=1), is_outside
 
@@ -327,10 +323,8 @@ def split_by_clutter(
     """Return positions with a clear view of the middle, and others that look through clutter.
 
     A wall or a street is photographed from one side. From all others, large floaters hide it: even
-    the finest splats of an image are large. A few of them before an object are no clutter.
-
-    Returns:
-        All positions and none; or, in a capture from one side, at most 64 together.
+    the finest splats of an image are large. A few of them before an object are no clutter. These
+    are all positions and none; or, in a capture from one side, at most 64 together.
     """
     none = eyes[:0]
     if len(scene) < _FEW:
@@ -351,8 +345,8 @@ def split_by_clutter(
 
 
 def _facing_middle(layout: SceneLayout, eyes: Float[Tensor, "p 3"]) -> Cameras:
-    middle = layout.center if layout.room is None else layout.room
-    return cameras_at(eyes, middle - eyes, layout.up, size=(PIXELS, PIXELS), field=_FIELD)
+    directions = layout.subject - eyes
+    return cameras_at(eyes, directions, layout.up, size=(PIXELS, PIXELS), field=_FIELD)
 
 
 def _are_coarse(finest: Float[Tensor, "p"], least: float) -> Bool[Tensor, "p"]:

@@ -1,7 +1,6 @@
 """Score candidate cameras by small rendered images."""
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -24,6 +23,8 @@ _NEAR = 0.3
 _MOST_NEAR = 0.08
 _MOST_BLOCKED = 0.3
 _LEAST_FILLED = {False: 0.12, True: 0.8}
+"""Least mean alpha, by whether the camera is inside a room."""
+
 _VISIBLE = 0.25
 SMOOTH = 0.05
 """Largest splats of smooth sides that images were taken of, in robust radii. Sampling makes scenes
@@ -59,23 +60,10 @@ def cameras_at(
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CameraScores:
-    """Scores of cameras.
-
-    Attributes:
-        good: ``(c,)`` whether each camera has an unobstructed view of the scene.
-        penalties: ``(c,)`` penalties to choose among bad cameras; 0 is best.
-    """
-
-    good: Bool[Tensor, "c"]
-    penalties: Float[Tensor, "c"]
-
-
 def score_cameras(
-    layout: SceneLayout, cameras: Cameras, *, distances: Float[Tensor, "c"], inside: bool
-) -> CameraScores:
-    """Render small images and score the cameras by them.
+    layout: SceneLayout, cameras: Cameras, *, distances: Float[Tensor, "c"]
+) -> tuple[Bool[Tensor, "c"], Float[Tensor, "c"]]:
+    """Return which cameras are good by small images, and penalties (0 is best) of all of them.
 
     A camera is bad if it is inside a Gaussian, if something near fills too much of the image or
     hides its middle, or if too little of the image is filled.
@@ -89,11 +77,10 @@ def score_cameras(
     halfway = (images.alpha > _SOLID) & (depth < 0.45 * distances.to(depth)[:, None, None])
     blocked = halfway[:, rows, columns].double().mean(dim=(1, 2))
     filled = images.alpha.double().mean(dim=(1, 2))
-    lacking = (_LEAST_FILLED[inside] - filled).clamp_min(0)
+    lacking = (_LEAST_FILLED[layout.room is not None] - filled).clamp_min(0)
     enclosed = _inside_gaussians(layout, small)
     good = (near_share <= _MOST_NEAR) & (blocked <= _MOST_BLOCKED) & (lacking == 0) & ~enclosed
-    penalties = 2 * near_share + blocked + 2 * lacking + enclosed.double()
-    return CameraScores(good=good, penalties=penalties)
+    return good, 2 * near_share + blocked + 2 * lacking + enclosed.double()
 
 
 class SplatSizes(NamedTuple):
@@ -113,7 +100,7 @@ class SplatSizes(NamedTuple):
 def splat_sizes(layout: SceneLayout, cameras: Cameras) -> SplatSizes:
     """Return the median size of the splats that each camera shows, for at least one camera."""
     step = _SPARSE if len(layout.sample) >= _FEW else 1
-    sample = layout.sample.select(torch.arange(0, len(layout.sample), step, device="cpu"))
+    sample = layout.sample[::step]
     widths = splat_widths(sample)
     enlarged = sample.log_scales + 0.5 * math.log(step)
     sample = sample.with_tensors({"log_scales": enlarged}, {})

@@ -1,6 +1,5 @@
 """The surfaces of a scene as voxels, and the up direction and floor found from them."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -62,8 +61,7 @@ _SKY = 0.12
 _SKY_WEIGHT = 0.6
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Voxels:
+class Voxels(NamedTuple):
     """Points on the surfaces of a scene; each represents about the same area.
 
     Attributes:
@@ -216,11 +214,7 @@ def _growth(voxels: Voxels) -> Float[Tensor, "3"]:
 
 def _thinned(voxels: Voxels) -> Voxels:
     step = -(-len(voxels.points) // _MOST_VOXELS)
-    return Voxels(
-        points=voxels.points[::step],
-        normals=voxels.normals[::step],
-        log_sizes=voxels.log_sizes[::step],
-    )
+    return Voxels(*(part[::step] for part in voxels))
 
 
 def _ground(voxels: Voxels) -> _Plane | None:
@@ -228,12 +222,8 @@ def _ground(voxels: Voxels) -> _Plane | None:
     step = -(-len(voxels.points) // _GUESSES)
     normals, through = voxels.normals[::step], voxels.points[::step]
     heights = (normals * through).sum(dim=1)
-    counts = torch.stack(
-        [
-            _members(voxels, normal, height).sum()
-            for normal, height in zip(normals, heights, strict=True)
-        ]
-    )
+    guesses = zip(normals, heights, strict=True)
+    counts = torch.stack([_members(voxels, *guess).sum() for guess in guesses])
     best = torch.sort(counts, descending=True, stable=True).indices[:_REFINED]
     planes = [_refined(voxels, normals[row], float(heights[row])) for row in best.tolist()]
     largest = max(planes, key=lambda plane: plane.score * _bonus(plane.normal))
