@@ -1,6 +1,6 @@
 """The interface and output types that all backends share, and the choice of one by name."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Literal, Protocol, cast, get_args
@@ -14,6 +14,7 @@ from cvtgs.errors import DeviceError, InvalidArgumentError, MissingDependencyErr
 from cvtgs.math import segments
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.progress import ProgressEvent, ProgressListener
+from cvtgs.rendering.projection import Pinhole, to_pinholes
 from cvtgs.scene import GaussianScene
 
 BackendName = Literal["auto", "torch", "numba", "gsplat"]
@@ -134,16 +135,19 @@ def _backend(name: str, device: torch.device) -> Backend:
 
 
 def render_each(
-    images: Sequence[Callable[[], Float[Tensor, "h w 5"]]],
-    empty: Float[Tensor, "0 h w 5"],
+    render_one: Callable[[Pinhole], Float[Tensor, "h w 5"]],
+    scene: GaussianScene,
+    cameras: Cameras,
+    *,
     listener: ProgressListener,
 ) -> RasterOutput:
     """Render cameras one by one; an image holds colours, depth and transmittance."""
-    listener(ProgressEvent(stage=STAGE, done=0, total=len(images)))
-    found = [empty]
-    for number, image in enumerate(images, start=1):
-        found.append(image()[None])
-        listener(ProgressEvent(stage=STAGE, done=number, total=len(images)))
+    pinholes = to_pinholes(cameras)
+    listener(ProgressEvent(stage=STAGE, done=0, total=len(pinholes)))
+    found = [scene.means.new_zeros(0, cameras.height, cameras.width, 5)]
+    for number, pinhole in enumerate(pinholes, start=1):
+        found.append(render_one(pinhole)[None])
+        listener(ProgressEvent(stage=STAGE, done=number, total=len(pinholes)))
     layers = torch.cat(found)
     return RasterOutput(rgb=layers[..., :3], depth=layers[..., 3], alpha=1 - layers[..., 4])
 
@@ -164,6 +168,18 @@ def contributions_by_gradient(
         image = rasterize(gray, camera, sh_degree=0).rgb
         (gradient,) = torch.autograd.grad(image[..., 0].sum(), sh0)
     return gradient[:, 0, 0].double().clamp_min(0.0) / SH_C0
+
+
+def observe_by_gradient(
+    rasterize: Callable[..., RasterOutput],
+    scene: GaussianScene,
+    camera: Cameras,
+    *,
+    sh_degree: int,
+) -> tuple[RasterOutput, Float[Tensor, "n"]]:
+    """Render an image, and once more for the contributions to it."""
+    output = rasterize(scene, camera, sh_degree=sh_degree)
+    return output, contributions_by_gradient(rasterize, scene, camera)
 
 
 class PixelWeights:

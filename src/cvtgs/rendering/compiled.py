@@ -9,7 +9,7 @@ after changing a function that kernels in other files call, clear the cache.
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from functools import wraps
+from functools import partial, wraps
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -43,17 +43,10 @@ F = TypeVar("F", bound=Callable[..., object])
 prange = numba.prange
 """A range whose steps run in parallel in functions compiled by :func:`parallel`."""
 
-_SETTINGS: dict[str, Any] = {
-    "cache": True,
-    "nogil": True,
-    "error_model": "numpy",
-    "fastmath": {"contract"},
-}
-
 
 def serial(function: F) -> F:
     """Compile a function at its first call."""
-    return _compiled(function, **_SETTINGS)
+    return _compiled(function)
 
 
 def parallel(function: F) -> F:
@@ -62,7 +55,7 @@ def parallel(function: F) -> F:
     It uses as many threads as torch. Without OpenMP and TBB, the threads of numba take one loop at
     a time and end the process at a second one; so threads of the program wait for each other there.
     """
-    compiled = _compiled(function, **_SETTINGS, parallel=True)
+    compiled = _compiled(function, parallel=True)
 
     @wraps(function)
     def call(*arguments: Any) -> object:
@@ -85,11 +78,14 @@ def _takes_several_loops() -> bool:
         return False
 
 
-def _compiled(function: F, **settings: Any) -> F:
+def _compiled(function: F, **settings: bool) -> F:
+    compiler = partial(
+        numba.njit, nogil=True, error_model="numpy", fastmath={"contract"}, **settings
+    )
     try:
-        return cast("F", numba.njit(**settings)(function))
+        return cast("F", compiler(cache=True)(function))
     except RuntimeError:  # no cache folder is writable
-        return cast("F", numba.njit(**settings | {"cache": False})(function))
+        return cast("F", compiler()(function))
 
 
 @contextmanager

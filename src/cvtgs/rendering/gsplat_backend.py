@@ -6,9 +6,8 @@ of 0.99.
 """
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,9 +19,9 @@ from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.rendering import torch_backend
 from cvtgs.rendering.backends import (
     STAGE,
-    BlendingWeights,
     RasterOutput,
     contributions_by_gradient,
+    observe_by_gradient,
 )
 from cvtgs.rendering.projection import DILATION, NEAR_PLANE, to_matrices
 from cvtgs.scene import GaussianScene
@@ -80,21 +79,9 @@ def rasterize(
     return RasterOutput(rgb=layers[..., :3], depth=layers[..., 3], alpha=alpha[..., 0])
 
 
-def contributions(scene: GaussianScene, camera: Cameras) -> Tensor:
-    """Return the sum of each Gaussian's weights ``alpha * T`` over one image."""
-    return contributions_by_gradient(rasterize, scene, camera)
-
-
-def observe(
-    scene: GaussianScene, camera: Cameras, *, sh_degree: int
-) -> tuple[RasterOutput, Tensor]:
-    """Render one image; return it and the sum of each Gaussian's weights over it."""
-    return rasterize(scene, camera, sh_degree=sh_degree), contributions(scene, camera)
-
-
-def blending_weights(scene: GaussianScene, camera: Cameras) -> BlendingWeights:
-    """Return the weights by the torch backend, since gsplat does not return them."""
-    return torch_backend.blending_weights(scene, camera)
+contributions = partial(contributions_by_gradient, rasterize)
+observe = partial(observe_by_gradient, rasterize)
+blending_weights = torch_backend.blending_weights  # gsplat does not return them
 
 
 def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tuple[Tensor, Tensor]:
@@ -106,7 +93,7 @@ def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tu
         colors = evaluate(scene.sh0, rest, scene.means)
     means, viewmats, intrinsics = _about_cameras(scene, cameras)
     is_compensated = scene.antialiased and not any(cameras.ignores_tag)
-    layers, alpha, _ = _gsplat().rasterization(
+    layers, alpha, _ = import_module("gsplat").rasterization(
         means=means.float(),
         quats=scene.quats.float(),
         scales=scene.scales.float(),
@@ -142,10 +129,6 @@ def _about_cameras(scene: GaussianScene, cameras: Cameras) -> tuple[Tensor, Tens
     return means, viewmats.float().view(-1, 4, 4), intrinsics.float().view(-1, 3, 3)
 
 
-def _gsplat() -> Any:
-    return import_module("gsplat")
-
-
 @cache
 def _failure(device: str) -> str:
     """Return why gsplat does not render as the torch backend does, or "" if it does.
@@ -153,10 +136,10 @@ def _failure(device: str) -> str:
     Enables gradients, since the caller may have disabled them.
     """
     with torch.inference_mode(mode=False), torch.enable_grad():
-        image, gradient = _probe(_rasterize_by_torch, "cpu")
+        image, gradient = _probe(torch_backend.rasterize, "cpu")
         try:
-            _gsplat()
-            found_image, found_gradient = _probe(_rasterize_all, device)
+            import_module("gsplat")
+            found_image, found_gradient = _probe(rasterize, device)
         except ImportError as error:
             return f"it cannot be imported ({_first_line(error)})"
         except Exception as error:  # a build or a driver may raise anything
@@ -171,10 +154,7 @@ def _failure(device: str) -> str:
     return ""
 
 
-def _probe(
-    rasterize_all: Callable[[GaussianScene, Cameras, int], tuple[Tensor, Tensor]],
-    device: str,
-) -> tuple[Tensor, Tensor]:
+def _probe(rasterize_one: Callable[..., RasterOutput], device: str) -> tuple[Tensor, Tensor]:
     """Return an image of one Gaussian and a gradient with respect to its mean, on the CPU.
 
     Nothing in the scene is symmetric, so shifted pixels, swapped axes and a different order of SH
@@ -195,18 +175,11 @@ def _probe(
         width=8,
         height=7,
     ).to(device)
-    layers, alpha = rasterize_all(scene, cameras, 1)
-    image = torch.cat([layers, alpha], dim=-1)
+    output = rasterize_one(scene, cameras, sh_degree=1)
+    image = torch.cat([output.rgb, output.depth[..., None], output.alpha[..., None]], dim=-1)
     ramp = torch.linspace(0, 1, image.numel(), device=image.device).reshape(image.shape)
     (gradient,) = torch.autograd.grad((image * ramp).sum(), means)
     return image.detach().cpu(), gradient.cpu()
-
-
-def _rasterize_by_torch(
-    scene: GaussianScene, cameras: Cameras, sh_degree: int
-) -> tuple[Tensor, Tensor]:
-    output = torch_backend.rasterize(scene, cameras, sh_degree=sh_degree)
-    return torch.cat([output.rgb, output.depth[..., None]], dim=-1), output.alpha[..., None]
 
 
 def _first_line(error: Exception) -> str:

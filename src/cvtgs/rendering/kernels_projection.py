@@ -32,21 +32,15 @@ def rotation_of(quat: Array, out: Array) -> float:
     w, x, y, z = quat[0] / largest, quat[1] / largest, quat[2] / largest, quat[3] / largest
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w / norm, x / norm, y / norm, z / norm
-    out[0, 0], out[0, 1], out[0, 2] = (
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-    )
-    out[1, 0], out[1, 1], out[1, 2] = (
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-    )
-    out[2, 0], out[2, 1], out[2, 2] = (
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    )
+    out[0, 0] = 1 - 2 * (y * y + z * z)
+    out[0, 1] = 2 * (x * y - w * z)
+    out[0, 2] = 2 * (x * z + w * y)
+    out[1, 0] = 2 * (x * y + w * z)
+    out[1, 1] = 1 - 2 * (x * x + z * z)
+    out[1, 2] = 2 * (y * z - w * x)
+    out[2, 0] = 2 * (x * z - w * y)
+    out[2, 1] = 2 * (y * z + w * x)
+    out[2, 2] = 1 - 2 * (x * x + y * y)
     return float(norm * largest)
 
 
@@ -83,8 +77,11 @@ def axes_of(rotation: Array, log_scales: Array, camera: Array, local: Array, out
 
 
 @serial
-def covariance_of(axes: Array, dilation: float) -> tuple[float, float, float, float]:
-    """Return a, b, d of the dilated covariance ``(a b; b d)``, and the undilated determinant/d."""
+def covariance_of(axes: Array, dilation: float) -> tuple[float, float, float, float, float]:
+    """Return a, b, d of the dilated covariance ``(a b; b d)``, and both determinants over d.
+
+    The first is that of the dilated covariance, the second that of the undilated one.
+    """
     a, b, d = dilation, 0.0, dilation
     for k in range(3):
         a += axes[3, k] * axes[3, k]
@@ -95,14 +92,14 @@ def covariance_of(axes: Array, dilation: float) -> tuple[float, float, float, fl
         i, j = (k + 1) % 3, (k + 2) % 3
         minor = axes[3, i] * axes[4, j] - axes[3, j] * axes[4, i]
         bare += minor * minor / d
-    return a, b, d, bare
+    return a, b, d, bare + dilation * (a + d - dilation) / d, bare
 
 
 @serial
 def survival_of(axes: Array, dilation: float) -> float:
     """Return the share of its opacity that an antialiased Gaussian keeps."""
-    a, _, d, bare = covariance_of(axes, dilation)
-    return math.sqrt(bare / (bare + dilation * (a + d - dilation) / d))
+    _, _, _, schur, bare = covariance_of(axes, dilation)
+    return math.sqrt(bare / schur)
 
 
 @serial
@@ -146,9 +143,7 @@ def sigmoid(logit: float) -> float:
 @serial
 def splat_of(axes: Array, local: Array, camera: Array, opacity: float, out: Array) -> bool:
     """Write a packed splat except its colour; return whether it touches the image."""
-    dilation = camera[8, 2]
-    a, b, d, bare = covariance_of(axes, dilation)
-    schur = bare + dilation * (a + d - dilation) / d
+    a, b, d, schur, _ = covariance_of(axes, camera[8, 2])
     x = camera[4, 0] * local[0] / local[2] + camera[5, 0]
     y = camera[4, 1] * local[1] / local[2] + camera[5, 1]
     reach = 2 * math.log(opacity / MIN_ALPHA)
@@ -262,8 +257,7 @@ def covariance_gradient(
     grad: Array, axes: Array, dilation: float, antialiased: bool
 ) -> tuple[float, float, float]:
     """Return the gradient by a, b, d of the covariance."""
-    a, b, d, bare = covariance_of(axes, dilation)
-    schur = bare + dilation * (a + d - dilation) / d
+    a, b, d, schur, bare = covariance_of(axes, dilation)
     shear, flat = -b / d, 1 / d
     of_schur = 0.5 * grad[2] / (schur * schur)
     of_a = of_schur

@@ -254,18 +254,13 @@ class TileWeights:
     """
 
     def __init__(
-        self,
-        splats: SplatArrays,
-        tiles: TileArrays,
-        size: tuple[int, int],
-        *,
-        centers: Array,
-        count: int,
+        self, splats: SplatArrays, tiles: TileArrays, size: tuple[int, int], *, count: int
     ) -> None:
         packed = splats.packed
         self._rows, self._splat_starts, self._tiles = splats.rows, splats.starts, tiles
         self._size, self._count = size, count
         entries = len(tiles.lists)
+        centers = (np.arange(max(size)) + 0.5).astype(packed.dtype)
         counts = np.zeros(entries, np.int64)
         count_pixels(packed, tiles, size, centers, counts)
         starts = np.zeros(entries + 1, np.int64)

@@ -1,6 +1,5 @@
 """The fast backend on CPUs: projection, tiles and compositing compiled by numba."""
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,12 +52,13 @@ def rasterize(
     tiles, and the image. The backward pass needs ``10 p`` numbers at a time.
     """
     tensors = [tensor.contiguous() for tensor in scene.tensors().values()]
-    images = [
-        partial(_Render.apply, _settings(camera, sh_degree, scene), *tensors)
-        for camera in to_pinholes(cameras)
-    ]
-    empty = scene.means.new_zeros(0, cameras.height, cameras.width, 5)
-    return render_each(images, empty, listener)
+
+    def render_one(camera: Pinhole) -> Float[Tensor, "h w 5"]:
+        settings = _settings(camera, sh_degree, scene)
+        image: Tensor = _Render.apply(settings, *tensors)  # type: ignore[no-untyped-call]
+        return image
+
+    return render_each(render_one, scene, cameras, listener=listener)
 
 
 def contributions(scene: GaussianScene, camera: Cameras) -> Float[Tensor, "n"]:
@@ -89,8 +89,7 @@ def blending_weights(scene: GaussianScene, camera: Cameras) -> TileWeights:
     (pinhole,) = to_pinholes(camera)
     settings = _settings(pinhole, 0, scene)
     splats, tiles = _splats_by_tile(_arrays(scene), settings)
-    centers = (np.arange(max(settings.size)) + 0.5).astype(splats.packed.dtype)
-    return TileWeights(splats, tiles, settings.size, centers=centers, count=len(scene))
+    return TileWeights(splats, tiles, settings.size, count=len(scene))
 
 
 def _arrays(scene: GaussianScene) -> GaussianArrays:

@@ -27,7 +27,6 @@ FRUSTUM_MARGIN = 0.3
 MAX_ALPHA = 0.99
 """Largest alpha of one Gaussian in a pixel."""
 
-
 MIN_TRANSMITTANCE = 1e-4
 """A pixel is finished before the Gaussian that would lower its transmittance below this."""
 
@@ -55,24 +54,23 @@ class Pinhole:
     focal: tuple[float, float]
     principal: tuple[float, float]
     size: tuple[int, int]
-    dilation: float = DILATION
-    ignores_tag: bool = False
+    dilation: float
+    ignores_tag: bool
 
     @property
-    def slopes(self) -> tuple[tuple[float, float], tuple[float, float]]:
+    def slopes(self) -> list[tuple[float, float]]:
         """Bounds to which x/z and y/z are clamped in the Jacobian of the projection.
 
         With a centred principal point they are 1.3 times the tangent of half the field of view, as
         in 3DGS; otherwise they move with the edges of the image, as in gsplat.
         """
-        (x_low, x_high), (y_low, y_high) = (
+        return [
             (
                 -principal / focal - FRUSTUM_MARGIN * 0.5 * size / focal,
                 (size - principal) / focal + FRUSTUM_MARGIN * 0.5 * size / focal,
             )
             for focal, principal, size in zip(self.focal, self.principal, self.size, strict=True)
-        )
-        return (x_low, x_high), (y_low, y_high)
+        ]
 
 
 class CameraTensors(NamedTuple):

@@ -85,21 +85,12 @@ def rasterize(
     With gradients each camera also keeps the tensors of its projection, ``30 p`` bytes and the
     image; its backward pass needs ``10 p`` numbers at a time.
     """
-    empty = scene.means.new_zeros(0, cameras.height, cameras.width, 5)
-    images = [partial(_render_one, scene, camera, sh_degree) for camera in to_pinholes(cameras)]
-    return backends.render_each(images, empty, listener)
+    render_one = partial(_render_one, scene, sh_degree)
+    return backends.render_each(render_one, scene, cameras, listener=listener)
 
 
-def contributions(scene: GaussianScene, camera: Cameras) -> Tensor:
-    """Return the sum of each Gaussian's weights ``alpha * T`` over one image."""
-    return backends.contributions_by_gradient(rasterize, scene, camera)
-
-
-def observe(
-    scene: GaussianScene, camera: Cameras, *, sh_degree: int
-) -> tuple[RasterOutput, Tensor]:
-    """Render one image; return it and the sum of each Gaussian's weights over it."""
-    return rasterize(scene, camera, sh_degree=sh_degree), contributions(scene, camera)
+contributions = partial(backends.contributions_by_gradient, rasterize)
+observe = partial(backends.observe_by_gradient, rasterize)
 
 
 @torch.no_grad()
@@ -124,21 +115,14 @@ def blending_weights(scene: GaussianScene, camera: Cameras) -> PixelWeights:
     return PixelWeights(pixels, rows, weights, size=pinhole.size, count=len(scene))
 
 
-def _render_one(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Float[Tensor, "h w 5"]:
+def _render_one(scene: GaussianScene, sh_degree: int, camera: Pinhole) -> Float[Tensor, "h w 5"]:
     splats = project(scene, camera, sh_degree)
     lists = intersect(splats, camera.size, TILE.get(scene.device.type, _TILE_ELSEWHERE))
     tiles: Tensor = _Composite.apply(pack(splats), lists)  # type: ignore[no-untyped-call]
-    return _assemble(tiles, lists, camera.size)
-
-
-def _assemble(
-    tiles: Float[Tensor, "t side side 5"], lists: TileLists, size: tuple[int, int]
-) -> Float[Tensor, "h w 5"]:
-    """Join tiles to an image, cropped to its size."""
     down = len(tiles) // lists.across
     grid = tiles.unflatten(0, (down, lists.across)).transpose(1, 2)
     overhanging: Tensor = grid.reshape(down * lists.side, lists.across * lists.side, -1)
-    return overhanging[: size[1], : size[0]]
+    return overhanging[: camera.size[1], : camera.size[0]]
 
 
 class _Composite(torch.autograd.Function):
