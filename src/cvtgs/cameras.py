@@ -1,6 +1,7 @@
 """Pinhole cameras, and view matrices from camera positions and targets."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -101,7 +102,7 @@ class Cameras:
         centers = -(rotations.transpose(1, 2) @ shifts)[:, :, 0]
         return centers / view_scales(self.viewmats)[:, None].square()
 
-    def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "c"]) -> Self:
+    def select(self, rows: Sequence[int] | Int[Tensor, "m"] | Bool[Tensor, "c"]) -> Self:
         """Return some of the cameras.
 
         Args:
@@ -136,7 +137,7 @@ class Cameras:
         """
         if len(self) == 1:  # a selection would copy the row number to the device
             return [self]
-        return [self.select(torch.tensor([row], device="cpu")) for row in range(len(self))]
+        return [self.select([row]) for row in range(len(self))]
 
     def to(self, device: torch.device | str) -> Self:
         """Move the cameras to a device.
@@ -308,9 +309,7 @@ class Cameras:
             InvalidArgumentError: The count is no whole number above 0.
         """
         check_whole(count, "count")
-        return self.select(
-            torch.tensor(spread_rows(len(self), count), dtype=torch.int64, device="cpu")
-        )
+        return self.select(spread_rows(len(self), count))
 
 
 def checked_cameras(cameras: object) -> Cameras:

@@ -162,13 +162,6 @@ class ImageBuffer:
 
     def draw(self) -> ViewImage:
         """Return a training image, in half precision."""
-        image, stride = self._next()
-        if stride == 1:
-            return image
-        first = (self._rng.randrange(stride), self._rng.randrange(stride))
-        return image.every(stride, first=first)
-
-    def _next(self) -> tuple[ViewImage, int]:
         self._drawn += 1
         later = self._drawn - self._first
         is_due = later <= 0 or later % self._config.steps_per_image == 0
@@ -176,12 +169,16 @@ class ImageBuffer:
         if camera is None:
             used = self._kept.pop(self._rng.randrange((len(self._kept) + 1) // 2))
             self._kept.append(used)
-            return used
-        if len(self._kept) == self._capacity:
-            self._kept.pop(self._rng.randrange(len(self._kept)))
-        self._kept.append((render_view(self._full, camera).half(), self._config.stride))
-        self.rendered += 1
-        return self._kept[-1]
+        else:
+            if len(self._kept) == self._capacity:
+                self._kept.pop(self._rng.randrange(len(self._kept)))
+            self._kept.append((render_view(self._full, camera).half(), self._config.stride))
+            self.rendered += 1
+        image, stride = self._kept[-1]
+        if stride == 1:
+            return image
+        first = (self._rng.randrange(stride), self._rng.randrange(stride))
+        return image.every(stride, first=first)
 
     def draw_background(self) -> Float[Tensor, "3"]:
         """Return a random color."""

@@ -76,7 +76,7 @@ class Limits:
     def share(self) -> float:
         """Return the used share of the steps or seconds, whichever is larger."""
         of_steps = self.steps / self._steps if self._steps else 0.0
-        elapsed = time.perf_counter() - self._start if self._seconds else 0.0
+        elapsed = time.perf_counter() - self._start
         return min(1.0, max(of_steps, elapsed / self._seconds if self._seconds else 0.0))
 
     def begin(self) -> None:
