@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from cvtgs import GaussianScene
+from cvtgs import GaussianScene, concatenate
 from cvtgs.analysis import ambient_visibility
 from cvtgs.config import Rates
 from cvtgs.math.frames import robust_frame
@@ -40,6 +40,16 @@ def test_copies_of_a_gaussian_share_its_learning_rate():
     twice = full.select(torch.arange(300).repeat(2))
     assert not learning_rate_scales(full, full).any()
     torch.testing.assert_close(learning_rate_scales(full, twice), 0.5 * visibility_of(full))
+
+
+@pytest.mark.parametrize("name", ["log_scales", "logit_opacities", "sh0"])
+def test_exact_gaussians_at_one_position_do_not_move(name):
+    full = full_scene(100)
+    other = full.with_tensors({name: full.tensors()[name] - 1.0}, {})
+    both = concatenate([full, other, full])  # also two of each that are equal
+    assert not learning_rate_scales(both, both).any()
+    order = torch.randperm(300, generator=torch.Generator().manual_seed(0))
+    assert not learning_rate_scales(both.select(order), both).any()
 
 
 @pytest.mark.parametrize("name", ["means", "log_scales", "logit_opacities", "sh0"])

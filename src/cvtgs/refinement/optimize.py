@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.analysis import ambient_visibility
 from cvtgs.config import Rates, RefineConfig
 from cvtgs.cvt import nearest_site
+from cvtgs.cvt.nearest import runs_of_equal
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation.scorer import MOST_PSNR, Scorer
 from cvtgs.losses import relative_loss
@@ -33,6 +34,9 @@ THINNEST = 0.1
 
 MOST_CONCENTRATED = 0.75
 """So a changed Gaussian that represents only one other still moves, at a quarter of the length."""
+
+MARKING = ("log_scales", "logit_opacities", "sh0")
+"""What tells Gaussians at one position apart."""
 
 _BETAS = (0.6, 0.99)
 
@@ -330,9 +334,9 @@ def _concentrations(small: GaussianScene, full: GaussianScene) -> Float[Tensor, 
     Simpson 1949, one over their effective number), at most :data:`MOST_CONCENTRATED`, or the own
     share of a Gaussian unchanged from the full scene, if that is larger.
     """
-    labels, _ = nearest_site(full.means, small.means)
+    labels = _nearest_or_equal(full, small)
     same = torch.ones_like(labels, dtype=torch.bool)
-    for name in ("means", "log_scales", "logit_opacities", "sh0"):
+    for name in ("means", *MARKING):
         before, now = getattr(full, name), getattr(small, name)
         same &= (before == now[labels]).reshape(len(full), -1).all(dim=1)
     labels, masses, same = labels.cpu(), full.masses.double().cpu(), same.cpu()
@@ -342,3 +346,34 @@ def _concentrations(small: GaussianScene, full: GaussianScene) -> Float[Tensor, 
     own = torch.zeros_like(around)
     own.scatter_reduce_(0, labels[same], shares[same], "amax")
     return torch.maximum(squares.clamp_max(MOST_CONCENTRATED), own.clamp_max(1.0)).to(small.device)
+
+
+def _nearest_or_equal(full: GaussianScene, small: GaussianScene) -> Int[Tensor, "n"]:
+    """Return the nearest small Gaussian of each; of several at one position, an equal one."""
+    if runs_of_equal(small.means) is None:
+        return nearest_site(full.means, small.means)[0]
+    unit = 1e-9 * robust_frame(small.means).radius / len(full)
+    points, sites = (
+        torch.cat([scene.means.double(), unit * _marks(scene)[:, None]], dim=1)
+        for scene in (full, small)
+    )
+    return nearest_site(points, sites)[0]
+
+
+def _marks(scene: GaussianScene) -> Float[Tensor, "n"]:
+    """Return a number for every Gaussian, the same only for equal ones; copies are numbered."""
+    marks = torch.zeros_like(scene.logit_opacities, dtype=torch.float64)
+    columns = (column for name in MARKING for column in _flat(scene, name).unbind(1))
+    for number, column in enumerate(columns):
+        marks += column.double() * math.sqrt(2 + number)  # incommensurable: sums rarely coincide
+    marks %= 1.0
+    runs = runs_of_equal(torch.cat([scene.means.double(), marks[:, None]], dim=1))
+    if runs is not None:
+        order, ranks = runs
+        marks[order] += ranks
+    return marks
+
+
+def _flat(scene: GaussianScene, name: str) -> Float[Tensor, "n c"]:
+    values: Tensor = getattr(scene, name)
+    return values.reshape(len(scene), -1)
