@@ -333,7 +333,7 @@ def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) ->
     """Return the share of Gaussians at exactly the position of another of the same colour.
 
     For large scenes it is estimated from a sample, which is chosen by a hash of the position, so
-    that duplicates are sampled together.
+    that duplicates are sampled together. A crowd at one position counts wholly or not at all.
 
     Args:
         means: Positions.
