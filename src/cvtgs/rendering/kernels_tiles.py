@@ -43,8 +43,10 @@ def strip(
 
 
 @serial
-def tiles_of(splat: Array, size: tuple[int, int], side: int, out: Ints, start: int) -> int:
-    """Count the tiles of a splat; also write their indices unless ``start`` is negative."""
+def tiles_of(
+    splat: Array, size: tuple[int, int], side: int, out: Ints, start: int, most: int
+) -> int:
+    """Count the tiles of a splat, and write the indices of the first ``most`` of them."""
     reach = max(0.0, 2.0 * (splat[5] - LOG_MIN_ALPHA))
     half = math.sqrt(reach / (-2.0 * splat[4]))
     top, bottom = pixel_range(splat[1] - half, splat[1] + half, size[1])
@@ -58,26 +60,30 @@ def tiles_of(splat: Array, size: tuple[int, int], side: int, out: Ints, start: i
         if last < first:
             continue
         for column in range(first // side, last // side + 1):
-            if start >= 0:
+            if count < most:
                 out[start + count] = row * across + column
             count += 1
     return count
 
 
 @parallel
-def count_tiles(packed: Array, size: tuple[int, int], side: int, counts: Ints) -> None:
-    """Write the number of tiles that each splat touches."""
+def count_tiles(packed: Array, size: tuple[int, int], side: int, counts: Ints, first: Ints) -> None:
+    """Write the number of tiles that each splat touches, and the index of the first."""
     for i in prange(len(packed)):
-        counts[i] = tiles_of(packed[i], size, side, counts, -1)
+        counts[i] = tiles_of(packed[i], size, side, first, i, 1)
 
 
 @parallel
 def write_tiles(
-    packed: Array, size: tuple[int, int], side: int, starts: Ints, tile_ids: Ints
+    packed: Array, size: tuple[int, int], side: int, starts: Ints, first: Ints, tile_ids: Ints
 ) -> None:
-    """Write the indices of the tiles that each splat touches."""
+    """Write the indices of the tiles that each splat touches; most splats touch only the first."""
     for i in prange(len(packed)):
-        tiles_of(packed[i], size, side, tile_ids, starts[i])
+        count = starts[i + 1] - starts[i]
+        if count == 1:
+            tile_ids[starts[i]] = first[i]
+        elif count > 1:
+            tiles_of(packed[i], size, side, tile_ids, starts[i], count)
 
 
 @serial
