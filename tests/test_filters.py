@@ -6,6 +6,7 @@ import torch
 import cvtgs
 from cvtgs.analysis import analyze
 from cvtgs.edit import Motion, move
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import psnr
 from cvtgs.filters import FLYAWAY_RADII, filter_rows, flyaway_rows, visible_rows
 from cvtgs.validity import invalid_rows, standardized, with_finite_opacities
@@ -210,3 +211,43 @@ def test_gaussians_that_are_never_drawn_are_no_haze_and_no_frame(opacity):
     assert frames[0].radius == frames[1].radius
     assert torch.equal(frames[0].center, frames[1].center)
     assert analyze(unseen, cvtgs.SimplifyConfig()).frame.radius > 0  # of all, if none is drawn
+
+
+ONES, SCENE, CONFIG = torch.ones(5), random_scene(5), cvtgs.SimplifyConfig()
+ANALYSIS = analyze(SCENE, CONFIG)
+
+
+def visible(opacities=ONES, masses=ONES, **changes):
+    given = {"min_opacity": 0.1, "max_mass_share": 0.1, "at_least": 1}
+    return visible_rows(opacities, masses, **(given | changes))
+
+
+@pytest.mark.parametrize(
+    ("call", "text"),
+    [
+        (lambda: filter_rows(SCENE[:3], ANALYSIS, 1, CONFIG.filter), "analysis must be that of the "
+         "3 Gaussians of the scene, found one of 5."),
+        (lambda: filter_rows(None, ANALYSIS, 1, CONFIG.filter), "scene must be of type "
+         "GaussianScene, found NoneType."),
+        (lambda: filter_rows(SCENE, ANALYSIS, 6, CONFIG.filter), "target must be a whole number "
+         "between 1 and the 5 Gaussians of the scene, found 6."),
+        (lambda: filter_rows(SCENE, ANALYSIS, "a", CONFIG.filter), "scene, found 'a'."),
+        (lambda: filter_rows(SCENE, ANALYSIS, 1.5, CONFIG.filter), "scene, found 1.5."),
+        (lambda: visible(masses=ONES[:3]), "masses must be a tensor of floats of shape (5,), found "
+         "torch.float32 of shape (3,)."),
+        (lambda: visible(ONES * NAN), "opacities must be between 0 and 1, found nan to nan."),
+        (lambda: visible(min_opacity=-1), "min_opacity must be a number from 0 to 1, found -1."),
+        (lambda: visible(max_mass_share=5), "max_mass_share must be a number from 0 to 1, found "
+         "5."),
+        (lambda: visible(at_least=-10), "at_least must be a whole number between 0 and the 5 "
+         "Gaussians, found -10."),
+        (lambda: flyaway_rows(ONES, ONES[:3], max_share=0.1), "found torch.float32 of shape (3,)."),
+        (lambda: flyaway_rows(ONES, ONES, max_share=-1), "max_share must be a number from 0 to 1, "
+         "found -1."),
+        (lambda: flyaway_rows(ONES, ONES, max_share="a"), "found 'a'."),
+    ],
+)  # fmt: skip
+def test_wrong_arguments(call, text):
+    with pytest.raises(InvalidArgumentError) as caught:
+        call()
+    assert str(caught.value).endswith(text)

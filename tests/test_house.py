@@ -20,7 +20,7 @@ TEXTS = {path: path.read_text(encoding="utf-8") for path in FILES}
 # modules it needs; `devices` and `cameras` (data) stand as low as their imports allow.
 LEVELS = [
     {"errors", "progress", "startup", "text"},
-    {"devices"},
+    {"devices", "checks"},
     {"math", "clock", "plots", "counts", "boxes", "selection"},
     {"config", "scene", "cameras", "processes"},
     {"validity", "edit"},

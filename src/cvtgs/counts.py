@@ -9,6 +9,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.text import shown
 
 if TYPE_CHECKING:  # the command line reads ratios before it sets up and loads torch
     from torch import Tensor
@@ -109,10 +110,20 @@ def written(number: "float | Tensor") -> str:
 
 
 def _is_ratio(value: object) -> bool:
+    return 0.0 < _number(value) <= 1.0
+
+
+def check_share(value: object, name: str) -> None:
+    """Raise unless a value is a number from 0 to 1."""
+    if not 0.0 <= _number(value) <= 1.0:
+        raise InvalidArgumentError(f"{name} must be a number from 0 to 1, found {shown(value)}.")
+
+
+def _number(value: object) -> float:
     try:
-        return not isinstance(value, str) and 0.0 < float(value) <= 1.0  # type: ignore[arg-type]
+        return math.nan if isinstance(value, str) else float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor of several numbers
-        return False
+        return math.nan
 
 
 def whole_number(number: object) -> int:
@@ -125,10 +136,16 @@ def whole_number(number: object) -> int:
         return -1
 
 
-def check_whole(value: object, name: str) -> None:
-    """Raise unless a value is a whole number above 0."""
-    if whole_number(value) < 1:
-        raise InvalidArgumentError(f"{name} must be a whole number above 0, found {value!r}.")
+def check_whole(
+    value: object, name: str, *, least: int = 1, most: int | None = None, things: str = ""
+) -> None:
+    """Raise unless a value is a whole number above 0, or at least 0, and at most one of things."""
+    number = whole_number(value)
+    if number < least or (most is not None and number > most):
+        limits = "above 0" if least else "at least 0"
+        if most is not None:
+            limits = f"between {least} and the {most:,} {things}"
+        raise InvalidArgumentError(f"{name} must be a whole number {limits}, found {shown(value)}.")
 
 
 def shortfall(valid: int, total: int, target: int) -> str:

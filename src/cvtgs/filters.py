@@ -7,7 +7,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.analysis import SceneAnalysis, drawn_rows, perspective_falloff
+from cvtgs.checks import check_range, checked
 from cvtgs.config import FilterConfig
+from cvtgs.counts import check_share, check_whole
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import divide
 from cvtgs.math.segments import running_sums, true_rows
 from cvtgs.scene import GaussianScene
@@ -32,6 +35,7 @@ class FilteredRows(NamedTuple):
     left_out_mass_share: float
 
 
+@checked
 def filter_rows(
     scene: GaussianScene, analysis: SceneAnalysis, target: int, config: FilterConfig
 ) -> FilteredRows:
@@ -47,8 +51,17 @@ def filter_rows(
 
     Returns:
         The rows that stay, and statistics of the dropped ones.
+
+    Raises:
+        InvalidArgumentError: The analysis is of another scene, or ``target`` is outside 1 to n.
     """
     opacities = analysis.opacities
+    if len(opacities) != len(scene):
+        raise InvalidArgumentError(
+            f"analysis must be that of the {len(scene):,} Gaussians of the scene, "
+            f"found one of {len(opacities):,}."
+        )
+    check_whole(target, "target", most=len(scene), things="Gaussians of the scene")
     keep, share = opacities >= config.min_opacity, config.max_mass_share
     if not analysis.plan.haze.active:
         share = 1.0
@@ -71,6 +84,7 @@ def filter_rows(
     return FilteredRows(true_rows(keep, int(count)), len(keep) - int(count), share)
 
 
+@checked
 def visible_rows(
     opacities: Float[Tensor, "n"],
     masses: Float[Tensor, "n"],
@@ -95,6 +109,10 @@ def visible_rows(
     Returns:
         Mask of the Gaussians that stay.
 
+    Raises:
+        InvalidArgumentError: Shapes do not fit together, a number is out of range, or (on the host)
+            an opacity is not from 0 to 1.
+
     Example:
         >>> opacities = torch.tensor([0.01, 0.05, 0.9])
         >>> masses = torch.tensor([0.1, 5.0, 90.0])
@@ -103,6 +121,10 @@ def visible_rows(
         ... ).tolist()
         [False, True, True]
     """
+    check_share(min_opacity, "min_opacity")
+    check_share(max_mass_share, "max_mass_share")
+    check_whole(at_least, "at_least", least=0, most=len(opacities), things="Gaussians")
+    check_range(opacities, 1, "opacities")
     faint = (opacities < min_opacity).nonzero()[:, 0]
     faint = faint[torch.sort(masses[faint], stable=True).indices]  # breaks ties of opacity
     faint = faint[torch.sort(opacities[faint], stable=True).indices]
@@ -124,6 +146,7 @@ def most_flyaways(total: int) -> int:
     return max(10, total // 100)
 
 
+@checked
 def flyaway_rows(
     distances: Float[Tensor, "n"], masses: Float[Tensor, "n"], *, max_share: float
 ) -> Bool[Tensor, "n"]:
@@ -140,12 +163,16 @@ def flyaway_rows(
     Returns:
         Mask of the flyaways.
 
+    Raises:
+        InvalidArgumentError: Shapes do not fit together, or ``max_share`` is not from 0 to 1.
+
     Example:
         >>> flyaway_rows(
         ...     torch.tensor([1.0, 1e6]), torch.tensor([1.0, 1e-12]), max_share=1e-3
         ... ).tolist()
         [False, True]
     """
+    check_share(max_share, "max_share")
     far = (distances > FLYAWAY_RADII).nonzero()[:, 0]
     found = torch.zeros(len(distances), dtype=torch.bool, device=distances.device)
     if len(far) > most_flyaways(len(distances)):

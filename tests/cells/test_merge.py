@@ -1,6 +1,7 @@
 """Cells become Gaussians: hand-computed merges, cells of one, extra columns, representatives."""
 
 import math
+from inspect import unwrap
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from scipy.special import spence
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.cells import Partition, keep_representatives, merge_cells
 from cvtgs.config import MergeConfig
+from cvtgs.errors import InvalidArgumentError
 from hard_cases import CASES
 from hard_scenes import ball
 from scenes import random_scene, same_bits
@@ -18,6 +20,7 @@ STANDARD = SimplifyConfig.from_preset("standard").merge
 CONFIGS = {"paper": PAPER, "standard": STANDARD}
 each_config = pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
 INF = float("inf")
+CELLS = Partition.from_labels(torch.tensor([0, 0, 1, 1]), 2)
 
 
 def merged(
@@ -108,7 +111,7 @@ def test_chunks_do_not_change_a_bit(monkeypatch, limit, config):
     labels = torch.randint(0, 40, (300,), generator=torch.Generator().manual_seed(0))
     labels[:40] = torch.arange(40)
     whole = merged(scene, labels, config)
-    monkeypatch.setitem(merge_cells.__globals__, "CHUNK_MEMBERS", limit)
+    monkeypatch.setitem(unwrap(merge_cells).__globals__, "CHUNK_MEMBERS", limit)
     assert same_bits(merged(scene, labels, config), whole)
 
 
@@ -147,7 +150,7 @@ def test_comments_and_layout_are_kept(config):
 
 
 def test_progress_counts_the_finished_cells(monkeypatch):
-    monkeypatch.setitem(merge_cells.__globals__, "CHUNK_MEMBERS", 4)
+    monkeypatch.setitem(unwrap(merge_cells).__globals__, "CHUNK_MEMBERS", 4)
     scene, told = random_scene(10), []
     cells = Partition.from_labels(torch.tensor([0, 0, 1, 2, 2, 2, 3, 3, 4, 0]), 5)
     merge_cells(scene, cells, config=STANDARD, on_cells=told.append)
@@ -262,3 +265,19 @@ def test_the_paper_preset_merges_without_representatives():
     assert not paper.merge.representatives
     small = Simplifier(None, config=paper, device="cpu").simplify(scene, 0.2)
     assert bool((small.log_scales[:, 0] > -10).all())
+
+
+@pytest.mark.parametrize(
+    ("scene", "partition", "config", "text"),
+    [
+        (random_scene(3), CELLS, STANDARD, "rows of the partition must be between 0 and 2, found "
+         "0 to 3."),
+        ("a.ply", CELLS, STANDARD, "scene must be of type GaussianScene, found str."),
+        (random_scene(4), [0, 1], STANDARD, "partition must be of type Partition, found list."),
+        (random_scene(4), CELLS, "standard", "config must be of type MergeConfig, found str."),
+    ],
+)  # fmt: skip
+def test_wrong_arguments(scene, partition, config, text):
+    with pytest.raises(InvalidArgumentError) as caught:
+        merge_cells(scene, partition, config=config)
+    assert str(caught.value) == text

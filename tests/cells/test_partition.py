@@ -144,3 +144,43 @@ def test_an_empty_cell_is_an_error():
     with pytest.raises(InvalidArgumentError) as caught:
         Partition.from_labels(torch.tensor([0, 3, 0]), 5)
     assert str(caught.value) == "every cell needs a member; 3 have none, the first is 1."
+
+
+LABELS = torch.tensor([0, 1, 1])
+
+
+@pytest.mark.parametrize(
+    ("labels", "count", "text"),
+    [
+        (LABELS.numpy(), 2, "labels must be a tensor of integers of shape (n,), found ndarray."),
+        (LABELS.double(), 2, "found torch.float64 of shape (3,)."),
+        (LABELS[None], 2, "found torch.int64 of shape (1, 3)."),
+        (LABELS, None, "count must be a whole number above 0, found None."),
+        (LABELS, 1.5, "count must be a whole number above 0, found 1.5."),
+        (LABELS, 0, "count must be a whole number above 0, found 0."),
+    ],
+)
+def test_wrong_labels_and_counts_are_errors(labels, count, text):
+    with pytest.raises(InvalidArgumentError) as caught:
+        Partition.from_labels(labels, count)
+    assert str(caught.value).endswith(text)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"order": LABELS.numpy()}, "order must be a tensor of signed integers of shape (n,), "
+         "found ndarray."),
+        ({"order": LABELS + 1}, "rows of the partition must be between 0 and 1, found 1 to 2."),
+        ({"offsets": torch.tensor([0, 2])}, "offsets must increase from 0 to the 3 rows of the "
+         "partition, found [0, 2]."),
+        ({"offsets": torch.tensor([0, 2, 1, 3])}, "found [0, 2, 1, 3]."),
+        ({"offsets": LABELS[:0]}, "found []."),
+    ],
+)  # fmt: skip
+def test_a_check_finds_what_does_not_fit_a_scene(changes, text):
+    whole = Partition(order=LABELS, offsets=torch.tensor([0, 1, 3]))
+    whole.check(2)
+    with pytest.raises(InvalidArgumentError) as caught:
+        replace(whole, **changes).check(2)
+    assert str(caught.value).endswith(text)

@@ -1,12 +1,14 @@
 """Weights and embedded positions of Gaussians in the tessellation."""
 
 import math
+from inspect import unwrap
 
 import pytest
 import torch
 
 from cvtgs.analysis import perspective_falloff
 from cvtgs.cvt import embed, tessellation_weights
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.spherical_harmonics import SH_C0
 
@@ -50,7 +52,7 @@ def test_embedding_in_chunks_gives_the_same(monkeypatch, contraction):
     g = torch.Generator().manual_seed(0)
     means, sh0 = torch.randn(100, 3, generator=g), torch.randn(100, 1, 3, generator=g)
     whole = embed(means, sh0, frame=FRAME, color=0.1, contraction=contraction)
-    monkeypatch.setitem(embed.__globals__, "CHUNK", 7)
+    monkeypatch.setitem(unwrap(embed).__globals__, "CHUNK", 7)
     assert torch.equal(embed(means, sh0, frame=FRAME, color=0.1, contraction=contraction), whole)
 
 
@@ -120,3 +122,19 @@ def test_flyaways_do_not_overflow(contraction):
     assert bool(points.isfinite().all())
     assert points[1:].tolist() == [[1.0, 0, 0], [0, 0, 0]]
     assert float(points[0, 0]) > 1.4
+
+
+def test_shapes_that_do_not_fit_are_errors():
+    means, ones = torch.zeros(4, 3), torch.ones(4)
+    for call, text in (
+        (lambda: embed(means[:, :2], frame=FRAME), "means must be a tensor of floats of shape (n, "
+         "3), found torch.float32 of shape (4, 2)."),
+        (lambda: embed(means, torch.zeros(5, 1, 3), frame=FRAME), "sh0 must be a tensor of floats "
+         "of shape (4, 1, 3) or None, found torch.float32 of shape (5, 1, 3)."),
+        (lambda: embed(means, frame=2.0), "frame must be of type RobustFrame, found float."),
+        (lambda: tessellation_weights(ones, ones[1:], area_power=1.0, floor=0.0), "areas must be a "
+         "tensor of floats of shape (4,), found torch.float32 of shape (3,)."),
+    ):  # fmt: skip
+        with pytest.raises(InvalidArgumentError) as caught:
+            call()
+        assert str(caught.value) == text

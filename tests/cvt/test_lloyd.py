@@ -8,10 +8,10 @@ from cvtgs.cvt import (
     fill_empty_cells,
     lloyd,
     nearest_scipy,
+    stratified_seeds,
     weighted_seeds,
     weighted_sums,
 )
-from cvtgs.cvt.tessellate import stratified_seeds
 from cvtgs.math.frames import morton_order
 
 BACKENDS = {"scipy": nearest_scipy}

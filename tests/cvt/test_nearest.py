@@ -7,8 +7,9 @@ import pytest
 import torch
 
 import oracles
-from cvtgs.cvt import nearest_neighbors, nearest_scipy
+from cvtgs.cvt import nearest_neighbors, nearest_scipy, nearest_several, nearest_site
 from cvtgs.cvt.device_search import nearest_in_tiles
+from cvtgs.errors import InvalidArgumentError
 
 
 def nearest_by_tiles(points, sites):
@@ -167,3 +168,41 @@ def test_points_far_from_nearly_all_sites_take_no_longer():
         nearest_scipy(points, sites)
         seconds.append(time.process_time() - start)
     assert seconds[1] < seconds[0] + 0.1
+
+
+PLANE = torch.randn(20, 2)
+NOT_FINITE = torch.tensor([[0.0, torch.nan], [0.0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    ("call", "text"),
+    [
+        (lambda: nearest_site(PLANE, PLANE[:0]), "sites must hold at least one position, found "
+         "shape (0, 2)."),
+        (lambda: nearest_scipy(PLANE[:, :0], PLANE[:, :0]), "found shape (20, 0)."),
+        (lambda: nearest_site(PLANE, PLANE[:, :1]), "sites must be a tensor of floats of shape (m, "
+         "2), found torch.float32 of shape (20, 1)."),
+        (lambda: nearest_site(PLANE.tolist(), PLANE), "points must be a tensor of floats of shape "
+         "(n, d), found list."),
+        (lambda: nearest_site(PLANE, NOT_FINITE), "points and sites must be finite, found NaN or "
+         "infinite coordinates."),
+        (lambda: nearest_several(NOT_FINITE, PLANE, 1), "points and sites must be finite"),
+        (lambda: nearest_neighbors(PLANE / 0, 1), "points and sites must be finite"),
+        (lambda: nearest_neighbors(PLANE, -1), "count must be a whole number at least 0, found "
+         "-1."),
+        (lambda: nearest_several(PLANE, PLANE, 0), "count must be a whole number above 0, found "
+         "0."),
+    ],
+)  # fmt: skip
+def test_wrong_arguments(call, text):
+    with pytest.raises(InvalidArgumentError) as caught:
+        call()
+    assert text in str(caught.value)
+
+
+def test_gradients_are_not_needed():
+    traced = PLANE.clone().requires_grad_()
+    for search in (nearest_site, lambda one, two: nearest_several(one, two, 2)):
+        for found, wanted in zip(search(traced, traced), search(PLANE, PLANE), strict=True):
+            assert torch.equal(found, wanted)
+    assert torch.equal(nearest_neighbors(traced, 3), nearest_neighbors(PLANE, 3))

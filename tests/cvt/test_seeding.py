@@ -1,5 +1,7 @@
 """First sites: distinct, exactly as many as asked for, and fair by weight."""
 
+from inspect import unwrap
+
 import pytest
 import torch
 
@@ -73,7 +75,7 @@ def test_shares_sum_to_the_total_weight(kind, subtests):
 
 
 def test_points_of_a_sample_weigh_as_much_as_those_that_they_represent(monkeypatch):
-    monkeypatch.setitem(sample_points.__globals__, "MIN_SAMPLES", 1)
+    monkeypatch.setitem(unwrap(sample_points).__globals__, "MIN_SAMPLES", 1)
     points, weights = torch.arange(8.0)[:, None], torch.tensor([1.0] * 7 + [9.0])
     sample, shares = sample_points(points, weights, 3)
     assert sample[:, 0].tolist() == [1.0, 5.0, 7.0]

@@ -1,10 +1,23 @@
 """The whole tessellation."""
 
+from inspect import unwrap
+
 import pytest
 import torch
 
 from cvtgs.config import SimplifyConfig, TessellationConfig
-from cvtgs.cvt import Tessellation, tessellate
+from cvtgs.cvt import (
+    Tessellation,
+    choose_seeds,
+    fill_empty_cells,
+    lloyd,
+    nearest_site,
+    sample_points,
+    stratified_seeds,
+    tessellate,
+    weighted_seeds,
+    weighted_sums,
+)
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.frames import morton_order
 
@@ -91,7 +104,7 @@ def test_more_iterations_lower_the_energy(seeding):
 
 
 def test_a_sample_is_nearly_as_good_as_all_points(monkeypatch):
-    monkeypatch.setitem(tessellate.__globals__, "MIN_SAMPLES", 1)
+    monkeypatch.setitem(unwrap(tessellate).__globals__, "MIN_SAMPLES", 1)
     points, weights = weighted_cloud(20_000)
     of_sample, of_all, unmoved = (
         tessellate(
@@ -108,9 +121,9 @@ def test_a_sample_is_nearly_as_good_as_all_points(monkeypatch):
 def test_a_sample_is_never_tiny(monkeypatch):
     points, weights = weighted_cloud(20_000)
     config = TessellationConfig(samples_per_site=24)
-    monkeypatch.setitem(tessellate.__globals__, "MIN_SAMPLES", 8000)
+    monkeypatch.setitem(unwrap(tessellate).__globals__, "MIN_SAMPLES", 8000)
     some = tessellate(points, weights, 3, config=config)
-    monkeypatch.setitem(tessellate.__globals__, "MIN_SAMPLES", 1)
+    monkeypatch.setitem(unwrap(tessellate).__globals__, "MIN_SAMPLES", 1)
     few = tessellate(points, weights, 3, config=config)
     everything = tessellate(points, weights, 3, config=TessellationConfig(samples_per_site=0))
     errors = [(result.sites - everything.sites).abs().max() for result in (some, few)]
@@ -168,11 +181,67 @@ def test_iterations_are_reported():
     assert told == [1, 2, 3, 4]
 
 
-@pytest.mark.parametrize("count", [0, -1, 6])
-def test_counts_out_of_range_are_errors(count):
-    points, weights = weighted_cloud(5)
+P, W, CONFIG = torch.randn(20, 3), torch.ones(20), TessellationConfig()
+LABELS = torch.zeros(20, dtype=torch.int64)
+BAD_ROW = torch.arange(20)[:, None] == 3
+
+
+def many_iterations(**changes):
+    given = {"nearest": nearest_site, "iterations": 2, "tolerance": 0.0}
+    return lloyd(P, changes.pop("weights", W), P[:5], **(given | changes))
+
+
+@pytest.mark.parametrize(
+    ("call", "text"),
+    [
+        (lambda: tessellate(P, W, 0, config=CONFIG), "count must be a whole number between 1 and "
+         "the 20 points, found 0."),
+        (lambda: tessellate(P, W, 1.5, config=CONFIG), "20 points, found 1.5."),
+        (lambda: tessellate(P.numpy(), W, 5, config=CONFIG), "points must be a tensor of floats of "
+         "shape (n, d), found ndarray."),
+        (lambda: tessellate(P[:, 0], W, 5, config=CONFIG), "found torch.float32 of shape (20,)."),
+        (lambda: tessellate(P, W[:7], 5, config=CONFIG), "weights must be a tensor of floats of "
+         "shape (20,), found torch.float32 of shape (7,)."),
+        (lambda: tessellate(P, W, 5, config="draft"), "config must be of type TessellationConfig, "
+         "found str."),
+        (lambda: tessellate(P, W, 5, config=CONFIG, seed="a"), "seed must be a whole number at "
+         "least 0, found 'a'."),
+        (lambda: tessellate(P, -W, 5, config=CONFIG), "weights must be finite and at least 0, "
+         "found -1.0 in row 0."),
+        (lambda: tessellate(P, W * torch.nan, 5, config=CONFIG), "found nan in row 0."),
+        (lambda: tessellate(P, W / BAD_ROW.logical_not()[:, 0], 5, config=CONFIG), "found inf in "
+         "row 3."),
+        (lambda: tessellate(P.where(~BAD_ROW, torch.nan), W, 5, config=CONFIG), "points and sites "
+         "must be finite, found NaN or infinite coordinates."),
+        (lambda: tessellate(P[:, :0], W, 5, config=CONFIG), "sites must hold at least one position,"
+         " found shape (5, 0)."),
+        (lambda: choose_seeds(W, 21, config=CONFIG, seed=0), "20 points, found 21."),
+        (lambda: choose_seeds(W, 5, config=CONFIG, seed=-1), "seed must be"),
+        (lambda: stratified_seeds(W, -1), "20 points, found -1."),
+        (lambda: stratified_seeds(W, 0), "20 points, found 0."),
+        (lambda: weighted_seeds(W, 21, torch.Generator()), "20 points, found 21."),
+        (lambda: weighted_seeds(-W, 5, torch.Generator()), "weights must be finite"),
+        (lambda: sample_points(P, W, -1), "size must be a whole number at least 0, found -1."),
+        (lambda: many_iterations(iterations=-1), "iterations must be a whole number at least 0"),
+        (lambda: many_iterations(weights=-W), "points and weights must be finite, and weights at "
+         "least 0, found an energy of -"),
+        (lambda: weighted_sums(P, W, LABELS + 7, 5), "labels must be between 0 and 4, found 7 to "
+         "7."),
+        (lambda: weighted_sums(P, W, LABELS.double(), 5), "labels must be a tensor of signed "
+         "integers of shape (20,), found torch.float64 of shape (20,)."),
+        (lambda: fill_empty_cells(LABELS, W, W, 21), "20 points, found 21."),
+        (lambda: fill_empty_cells(LABELS - 1, W, W, 5), "labels must be between 0 and 4"),
+    ],
+)  # fmt: skip
+def test_wrong_arguments(call, text):
     with pytest.raises(InvalidArgumentError) as caught:
-        tessellate(points, weights, count, config=TessellationConfig())
-    assert str(caught.value) == (
-        f"count must be between 1 and the number of points, 5; found {count}."
-    )
+        call()
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_gradients_are_not_needed():
+    plain = tessellate(P, W, 5, config=CONFIG)
+    traced = tessellate(P.clone().requires_grad_(), W.clone().requires_grad_(), 5, config=CONFIG)
+    assert torch.equal(traced.labels, plain.labels)
+    assert torch.equal(traced.sites, plain.sites)

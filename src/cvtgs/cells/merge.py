@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cells.partition import Partition
+from cvtgs.checks import checked
 from cvtgs.config import MergeConfig
 from cvtgs.devices import chunk_length, in_threads
 from cvtgs.math import depths, parameters
@@ -34,6 +35,7 @@ DOMINANT = 0.99
 """A member with more than this share of the mass of its cell represents it."""
 
 
+@checked
 def merge_cells(
     scene: GaussianScene,
     partition: Partition,
@@ -57,6 +59,9 @@ def merge_cells(
     Returns:
         A scene with one Gaussian per cell, in the order of the cells.
 
+    Raises:
+        InvalidArgumentError: The partition is not one of rows of this scene.
+
     Example:
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 4, sh_degree=0, seed=0)
@@ -64,6 +69,7 @@ def merge_cells(
         >>> len(merge_cells(scene, cells, config=MergeConfig()))
         2
     """
+    partition.check(len(scene))
     merged = scene.select(partition.order[partition.offsets[:-1]])
     cells, several = partition.select_several()
     done = len(partition) - len(cells)
@@ -267,6 +273,7 @@ def merged_depth(
     return torch.sqrt(found * parameters.divide(centers, areas).clamp_max(OPAQUE))
 
 
+@checked
 def keep_representatives(
     scene: GaussianScene, merged: GaussianScene, partition: Partition, *, areas: Float[Tensor, "n"]
 ) -> tuple[GaussianScene, Partition]:

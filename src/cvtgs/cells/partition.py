@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Integer
 from torch import Tensor
 
+from cvtgs.checks import check_kinds, check_range, checked
+from cvtgs.counts import check_whole
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import parameters
 from cvtgs.math.segments import (
@@ -20,6 +22,7 @@ from cvtgs.math.segments import (
     true_rows,
 )
 from cvtgs.scene import GaussianScene
+from cvtgs.text import shown
 
 MOST_SAMPLED = 32
 """Largest number of described members of a cell."""
@@ -47,7 +50,8 @@ class Partition:
     singles: int | None = None
 
     @classmethod
-    def from_labels(cls, labels: Int[Tensor, "n"], count: int) -> Self:
+    @checked
+    def from_labels(cls, labels: Integer[Tensor, "n"], count: int) -> Self:
         """Build the partition of labelled rows.
 
         Args:
@@ -58,12 +62,14 @@ class Partition:
             The partition; the members of a cell keep their order.
 
         Raises:
-            InvalidArgumentError: A label is out of range, or a cell has no member.
+            InvalidArgumentError: Labels are no integers, one is out of range, or a cell has no
+                member.
 
         Example:
             >>> Partition.from_labels(torch.tensor([1, 0, 1]), 2).order.tolist()
             [1, 0, 2]
         """
+        check_whole(count, "count")
         order, offsets = sort_by_label(labels, count)
         ends, counts = labels.aminmax() if len(labels) else (), offsets.diff()
         sums = (counts == 0).sum(), (counts == 1).sum()
@@ -78,6 +84,29 @@ class Partition:
                 f"every cell needs a member; {missing} have none, the first is {first}."
             )
         return cls(order=order, offsets=offsets, singles=singles)
+
+    def check(self, total: int) -> None:
+        """Check that the cells are made of rows of a scene.
+
+        Args:
+            total: Number of Gaussians of the scene.
+
+        Raises:
+            InvalidArgumentError: Types or shapes are wrong, a row is out of range, or a cell is
+                empty; values on other devices than CPUs are not checked, which would wait for them.
+        """
+        check_kinds(
+            {"order": Int[Tensor, "n"], "offsets": Int[Tensor, "m_plus_1"]},
+            {"order": self.order, "offsets": self.offsets},
+        )
+        check_range(self.order, total - 1, "rows of the partition")
+        if self.offsets.device.type == "cpu":
+            ends, count = torch.cat([self.offsets[:1], self.offsets[-1:]]), len(self.order)
+            if ends.tolist() != [0, count] or bool((self.counts < 1).any()):
+                raise InvalidArgumentError(
+                    f"offsets must increase from 0 to the {count} rows of the partition, "
+                    f"found {shown(self.offsets.tolist())}."
+                )
 
     def __len__(self) -> int:
         """Return the number of cells."""
@@ -216,6 +245,7 @@ class SampledMembers(NamedTuple):
     rates: Float[Tensor, "n"]
 
 
+@checked
 def sample_members(scene: GaussianScene, part: Partition) -> SampledMembers:
     """Take all members of small cells, and of large cells some in proportion to their mass.
 

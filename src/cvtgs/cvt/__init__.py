@@ -10,18 +10,16 @@ from cvtgs.cvt.nearest import (
     search_device,
     search_name,
 )
+from cvtgs.cvt.seeding import choose_seeds, stratified_seeds, weighted_seeds
 from cvtgs.cvt.tessellate import (
     LloydResult,
     Tessellation,
     centroids,
     choose_search,
-    choose_seeds,
     fill_empty_cells,
     lloyd,
     sample_points,
-    stratified_seeds,
     tessellate,
-    weighted_seeds,
     weighted_sums,
 )
 

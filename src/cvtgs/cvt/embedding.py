@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.checks import checked
 from cvtgs.devices import row_chunks
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import SH_C0
@@ -18,6 +19,7 @@ COLOR_HEADROOM = 0.5
 """Colours are clamped at 1 plus this."""
 
 
+@checked
 def embed(
     means: Float[Tensor, "n 3"],
     sh0: Float[Tensor, "n 1 3"] | None = None,
@@ -56,6 +58,7 @@ def embed(
     return points
 
 
+@checked
 def gaussian_weights(
     opacities: Float[Tensor, "n"], areas: Float[Tensor, "n"], area_power: float
 ) -> Float[Tensor, "n"]:
@@ -80,6 +83,7 @@ def gaussian_weights(
     return weights * areas**area_power if area_power else weights
 
 
+@checked
 def tessellation_weights(
     opacities: Float[Tensor, "n"], areas: Float[Tensor, "n"], *, area_power: float, floor: float
 ) -> Float[Tensor, "n"]:

@@ -1,8 +1,9 @@
 """Nearest sites and neighbours: by scipy's k-d tree on the host, or in tiles on CUDA."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from cvtgs.checks import checked
+from cvtgs.counts import check_whole
 from cvtgs.cvt.device_search import nearest_in_tiles
 from cvtgs.devices import HOST, thread_count
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.frames import robust_frame
 from cvtgs.math.segments import ascending_rows
 
@@ -35,6 +39,7 @@ def search_name(device: torch.device) -> str:
     return "tiles" if device.type == "cuda" else "scipy"
 
 
+@checked
 def nearest_site(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"]
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
@@ -47,11 +52,16 @@ def nearest_site(
     Returns:
         Labels and squared distances in float64. Ties may be resolved in any way.
 
+    Raises:
+        InvalidArgumentError: There is no site, shapes do not fit together, or (on the host) a
+            coordinate is not finite.
+
     Example:
         >>> labels, squared = nearest_site(torch.tensor([[0.9]]), torch.tensor([[0.0], [1.0]]))
         >>> labels.tolist()
         [1]
     """
+    _check_sites(sites)
     if points.device.type != "cuda":
         return nearest_scipy(points, sites)
     distinct = _one_of_each(sites)
@@ -59,6 +69,7 @@ def nearest_site(
     return labels[:, 0] if distinct is None else distinct[labels[:, 0]], squared[:, 0]
 
 
+@checked
 def nearest_scipy(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"]
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
@@ -75,12 +86,17 @@ def nearest_scipy(
     Returns:
         Labels and squared distances in float64. Ties may be resolved in any way.
 
+    Raises:
+        InvalidArgumentError: There is no site, shapes do not fit together, or (on the host) a
+            coordinate is not finite.
+
     Example:
         >>> labels, squared = nearest_scipy(torch.tensor([[0.9]]), torch.tensor([[0.0], [1.0]]))
         >>> labels.tolist()
         [1]
     """
-    device, points, sites = points.device, points.cpu(), sites.cpu()
+    _check_sites(sites)
+    device, points, sites = points.device, points.detach().cpu(), sites.detach().cpu()
     distinct = _one_of_each(sites)
     tree = build_tree(sites if distinct is None else sites[distinct])
     labels = np.empty(len(points), dtype=np.int64)
@@ -97,12 +113,31 @@ def nearest_scipy(
     return found.to(device), torch.from_numpy(squared).to(device)
 
 
+def _check_sites(sites: Float[Tensor, "m d"]) -> None:
+    if sites.numel() == 0:
+        raise InvalidArgumentError(
+            f"sites must hold at least one position, found shape {tuple(sites.shape)}."
+        )
+
+
+@contextmanager
+def _finite() -> Iterator[None]:
+    """Turn scipy's error about values that are not finite into one of cvtgs."""
+    try:
+        yield
+    except ValueError as error:
+        raise InvalidArgumentError(
+            "points and sites must be finite, found NaN or infinite coordinates."
+        ) from error
+
+
 def _one_of_each(sites: Float[Tensor, "m d"]) -> Int[Tensor, "k"] | None:
     """Return one row of every position, since trees cannot separate the others; None for all."""
     runs = runs_of_equal(sites)
     return None if runs is None else torch.sort(runs[0][runs[1] == 0]).values
 
 
+@_finite()
 def _in_threads(search: Callable[[slice], None], count: int) -> None:
     """Search all chunks of points, in as many threads as there are cores.
 
@@ -116,6 +151,7 @@ def _in_threads(search: Callable[[slice], None], count: int) -> None:
             pass
 
 
+@_finite()
 def build_tree(sites: Float[Tensor, "m d"]) -> Any:
     """Build scipy's k-d tree, split at the middles of boxes.
 
@@ -127,6 +163,7 @@ def build_tree(sites: Float[Tensor, "m d"]) -> Any:
     return cKDTree(np.asarray(sites, dtype=np.float64), balanced_tree=False)
 
 
+@checked
 def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m k"]:
     """Find the nearest other sites of every site, on CUDA if they are there, else on the host.
 
@@ -138,12 +175,18 @@ def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m
         Row numbers, k = min(count, m - 1); the site itself is not among them. Ties may be
         resolved in any way.
 
+    Raises:
+        InvalidArgumentError: There is no site, shapes or ``count`` do not fit, or (on the host) a
+            coordinate is not finite.
+
     Example:
         >>> nearest_neighbors(torch.tensor([[0.0], [1.0], [9.0]]), 1).tolist()
         [[1], [0], [1]]
     """
+    _check_sites(sites)
+    check_whole(count, "count", least=0)
     with_self = min(count + 1, len(sites))
-    apart = _apart(sites.to(search_device(sites.device)))
+    apart = _apart(sites.detach().to(search_device(sites.device)))
     rows, _ = _nearest_apart(apart, apart, with_self)
     # With coincident sites, the site itself may be anywhere or missing: then drop the last one.
     is_self = rows == torch.arange(len(sites), device=rows.device)[:, None]
@@ -153,6 +196,7 @@ def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m
     return rows.gather(1, others).to(sites.device)
 
 
+@checked
 def nearest_several(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
@@ -165,11 +209,17 @@ def nearest_several(
 
     Returns:
         Rows of the sites, nearest first, and their distances.
+
+    Raises:
+        InvalidArgumentError: There is no site, shapes or ``count`` do not fit, or (on the host) a
+            coordinate is not finite.
     """
+    _check_sites(sites)
+    check_whole(count, "count")
     device = search_device(sites.device)
-    apart = _apart(sites.to(device))
+    apart = _apart(sites.detach().to(device))
     more = apart.shape[1] - points.shape[1]
-    padded = torch.nn.functional.pad(points.to(device).double(), (0, more))
+    padded = torch.nn.functional.pad(points.detach().to(device).double(), (0, more))
     rows, distances = _nearest_apart(padded, apart, min(count, len(sites)))
     return rows.to(points.device), distances.to(points.device)
 

@@ -1,5 +1,6 @@
-"""Weighted centroidal Voronoi tessellation: seeds, Lloyd's algorithm, labels, empty cells."""
+"""Weighted centroidal Voronoi tessellation: Lloyd's algorithm, labels, empty cells."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -7,11 +8,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.checks import check_range, checked
 from cvtgs.config import TessellationConfig
+from cvtgs.counts import check_whole
 from cvtgs.cvt.nearest import NearestSite, nearest_site, search_device, search_once_per_position
+from cvtgs.cvt.seeding import choose_seeds, stratified_seeds
 from cvtgs.devices import move_together
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.math.segments import label_argmin, label_sums, running_sums, smallest_rows
+from cvtgs.math.segments import label_argmin, label_sums, smallest_rows
 
 MIN_SAMPLES = 1 << 15
 """Smallest sample of points for Lloyd; fewer would save next to no time."""
@@ -37,6 +41,7 @@ class Tessellation:
     refilled: int
 
 
+@checked
 def tessellate(
     points: Float[Tensor, "n d"],
     weights: Float[Tensor, "n"],
@@ -64,18 +69,16 @@ def tessellate(
         Labels and sites; exactly ``count`` cells, none empty.
 
     Raises:
-        InvalidArgumentError: ``count`` is outside 1 to n.
+        InvalidArgumentError: ``count`` is outside 1 to n, shapes do not fit together, a weight is
+            negative, or a value is not finite.
 
     Example:
         >>> points = torch.tensor([[0.0, 0, 0], [5, 0, 0], [5.1, 0, 0]])
         >>> tessellate(points, torch.ones(3), 2, config=TessellationConfig()).labels.tolist()
         [0, 1, 1]
     """
-    if not 1 <= count <= len(points):
-        raise InvalidArgumentError(
-            f"count must be between 1 and the number of points, {len(points)}; found {count}."
-        )
-    home = points.device
+    check_whole(count, "count", most=len(points), things="points")
+    points, weights, home = points.detach(), weights.detach(), points.device
     if count == len(points):  # nothing to group
         own = torch.arange(count, device=home)
         return Tessellation(
@@ -118,25 +121,7 @@ def choose_search(*, has_duplicates: bool) -> NearestSite:
     return search_once_per_position(nearest_site) if has_duplicates else nearest_site
 
 
-def choose_seeds(
-    weights: Float[Tensor, "n"], count: int, *, config: TessellationConfig, seed: int
-) -> Int[Tensor, "m"]:
-    """Choose the points at which the sites start.
-
-    Args:
-        weights: Weights of the points, in the order of a Morton curve.
-        count: Number of sites.
-        config: The settings; ``seeding`` is used.
-        seed: Seed of the random numbers, if ``seeding`` draws any.
-
-    Returns:
-        Rows of the points.
-    """
-    if config.seeding == "weighted":
-        return weighted_seeds(weights, count, torch.Generator().manual_seed(seed))
-    return stratified_seeds(weights, count)[0]
-
-
+@checked
 def sample_points(
     points: Float[Tensor, "n d"], weights: Float[Tensor, "n"], size: int
 ) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k"]]:
@@ -149,7 +134,12 @@ def sample_points(
 
     Returns:
         The points of the sample, and their weights.
+
+    Raises:
+        InvalidArgumentError: Shapes do not fit together, ``size`` is negative, or a weight is
+            negative or not finite.
     """
+    check_whole(size, "size", least=0)
     enough = max(size, MIN_SAMPLES)
     if size == 0 or enough >= len(points) // 2:
         return points, weights
@@ -157,6 +147,7 @@ def sample_points(
     return points[rows], shares
 
 
+@checked
 def fill_empty_cells(
     labels: Int[Tensor, "n"], weights: Float[Tensor, "n"], squared: Float[Tensor, "n"], count: int
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"], int]:
@@ -174,6 +165,10 @@ def fill_empty_cells(
     Returns:
         New labels, new squared distances, and the number of cells that were empty.
 
+    Raises:
+        InvalidArgumentError: Shapes do not fit together, ``count`` is outside 1 to n, or (on the
+            host) a label is out of range.
+
     Example:
         >>> labels, _, refilled = fill_empty_cells(
         ...     torch.tensor([0, 0]), torch.ones(2), torch.tensor([0.0, 4.0]), 2
@@ -181,6 +176,8 @@ def fill_empty_cells(
         >>> labels.tolist(), refilled
         ([0, 1], 1)
     """
+    check_whole(count, "count", most=len(labels), things="points")
+    check_range(labels, count - 1, "labels")
     members = torch.bincount(labels, minlength=count)
     empty = (members == 0).nonzero()[:, 0]
     if len(empty) == 0:
@@ -209,6 +206,7 @@ class LloydResult:
     energies: tuple[float, ...]
 
 
+@checked
 def lloyd(
     points: Float[Tensor, "n d"],
     weights: Float[Tensor, "n"],
@@ -235,6 +233,10 @@ def lloyd(
     Returns:
         The moved sites and the energies.
 
+    Raises:
+        InvalidArgumentError: Shapes do not fit together, ``iterations`` is negative, or the energy
+            is negative or not finite.
+
     Example:
         >>> from cvtgs.cvt import nearest_scipy
         >>> points = torch.tensor([[0.0], [1.0], [8.0]])
@@ -244,11 +246,17 @@ def lloyd(
         ... ).sites.tolist()
         [[0.5], [8.0]]
     """
+    check_whole(iterations, "iterations", least=0)
     energies: list[float] = []
-    sites = sites.double()
+    points, weights, sites = points.detach(), weights.detach(), sites.detach().double()
     for done in range(iterations):
         labels, squared = nearest(points, sites)
         energies.append(float((weights * squared).sum()))
+        if not 0.0 <= energies[-1] < math.inf:
+            raise InvalidArgumentError(
+                f"points and weights must be finite, and weights at least 0, "
+                f"found an energy of {energies[-1]}."
+            )
         if done > 0 and energies[-2] - energies[-1] <= tolerance * energies[-2]:
             break
         totals, sums = weighted_sums(points, weights, labels, len(sites))
@@ -257,6 +265,7 @@ def lloyd(
     return LloydResult(sites=sites, energies=tuple(energies))
 
 
+@checked
 def weighted_sums(
     points: Float[Tensor, "n d"], weights: Float[Tensor, "n"], labels: Int[Tensor, "n"], count: int
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m d"]]:
@@ -270,12 +279,18 @@ def weighted_sums(
 
     Returns:
         Sums of the weights, and of the points times their weights.
+
+    Raises:
+        InvalidArgumentError: Shapes do not fit together, or (on the host) a label is out of range.
     """
+    check_whole(count, "count")
+    check_range(labels, count - 1, "labels")
     columns = [torch.ones_like(weights), *points.unbind(1)]
     sums = label_sums(columns, labels, count, weights.double())
     return sums[0], sums[1:].T
 
 
+@checked
 def centroids(
     totals: Float[Tensor, "m"], sums: Float[Tensor, "m d"], fallback: Float[Tensor, "m d"]
 ) -> Float[Tensor, "m d"]:
@@ -292,76 +307,3 @@ def centroids(
     filled = totals > 0
     means = sums / totals.where(filled, 1.0)[:, None]
     return torch.where(filled[:, None], means, fallback)
-
-
-def stratified_seeds(
-    weights: Float[Tensor, "n"], count: int
-) -> tuple[Int[Tensor, "count"], Float[Tensor, "count"]]:
-    """Take points at equal steps of accumulated weight: systematic sampling, no random numbers.
-
-    Points that weigh at least one step are always taken, and the step is recomputed for the
-    others (Madow 1949), so every point is taken at most once.
-
-    Args:
-        weights: Weights of points along a space-filling curve, at least 0.
-        count: Number of points to take, at most n.
-
-    Returns:
-        Row numbers, ascending, and the weight that each taken point represents; these weights
-        add up to the sum of ``weights``.
-
-    Example:
-        >>> rows, shares = stratified_seeds(torch.tensor([1.0, 1.0, 1.0, 9.0]), 2)
-        >>> rows.tolist(), shares.tolist()
-        ([1, 3], [3.0, 9.0])
-    """
-    weights = weights.double()
-    if float(weights.sum()) <= 0:
-        weights = torch.ones_like(weights)
-    certain = torch.zeros(len(weights), dtype=torch.bool, device=weights.device)
-    while True:
-        free = count - int(certain.sum())
-        step = float(weights[~certain].sum()) / free if free else 0.0
-        heavier = ~certain & (weights >= step)
-        if free == 0 or not bool(heavier.any()) or step == 0.0:
-            break
-        heavy = heavier.nonzero()[:, 0]
-        heaviest = torch.sort(weights[heavy], stable=True, descending=True).indices[:free]
-        certain[heavy[heaviest]] = True
-    rows, others = certain.nonzero()[:, 0], (~certain).nonzero()[:, 0]
-    if free:  # the middles of equal steps of accumulated weight
-        total = running_sums(weights[others])
-        middles = (torch.arange(free, device=weights.device) + 0.5) * (total[-1] / free)
-        picks = torch.searchsorted(total, middles).clamp_max(len(others) - 1)
-        # Weights below one step give distinct picks, except for rounding and zero weights:
-        # equal picks move to the next free place.
-        places = torch.arange(free, device=weights.device)
-        picks = (picks - places).cummax(0).values + places
-        picks = torch.minimum(picks, len(others) - free + places)
-        rows = torch.sort(torch.cat([rows, others[picks]])).values
-    return rows, torch.where(certain, weights, step)[rows]
-
-
-def weighted_seeds(
-    weights: Float[Tensor, "n"], count: int, generator: torch.Generator
-) -> Int[Tensor, "count"]:
-    """Draw points at random without replacement, with probabilities by weight.
-
-    The points with the smallest ``-log(u) / w`` are taken (Efraimidis and Spirakis 2006).
-
-    Args:
-        weights: Weights, at least 0; points of weight 0 are taken last.
-        count: Number of points to draw, at most n.
-        generator: Random generator on the CPU, so that every device draws the same.
-
-    Returns:
-        Row numbers, ascending.
-
-    Example:
-        >>> weighted_seeds(torch.tensor([0.0, 1.0]), 1, torch.Generator().manual_seed(0)).tolist()
-        [1]
-    """
-    uniform = torch.rand(len(weights), generator=generator, dtype=torch.float64, device="cpu")
-    keys = -torch.log(uniform.clamp_min(1e-300)).to(weights.device) / weights.double()
-    chosen = torch.sort(keys, stable=True).indices[:count]
-    return torch.sort(chosen).values
