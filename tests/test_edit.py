@@ -191,6 +191,14 @@ def test_merge_widens_unlike_scenes_and_warns() -> None:
         (lambda: Sphere(center=(0.0, 0.0, 0.0), radius=-1), "a radius of at least 0"),
         (lambda: drop_faint(random_scene(2), 1.5), "from 0 to 1, found 1.5"),
         (lambda: drop_large(random_scene(2), 0.0), "above 0, found 0.0"),
+        (lambda: drop_faint(random_scene(2), "a"), "from 0 to 1, found 'a'"),
+        (lambda: drop_large(random_scene(2), None), "above 0, found None"),
+        (lambda: crop(random_scene(2), None), "regions must be boxes or spheres, found None"),
+        (lambda: move(random_scene(2), None), "motion must be a Motion, found None"),
+        *(
+            (lambda edit=edit: edit(None, 1), "scene must be a GaussianScene, found None")
+            for edit in (crop, drop_faint, drop_large, move)
+        ),
     ],
 )
 def test_invalid_arguments_are_refused(make, text: str) -> None:
@@ -235,6 +243,10 @@ def test_coordinates_stay_within_their_type() -> None:
         InvalidArgumentError, match=r"within 3\.4e\+38, the range of float32, found"
     ):
         move(scene, Motion(scale=1e39))
+    with pytest.raises(InvalidArgumentError, match=r"shrink all .* below 1\.18e-38, .* of 1e-60"):
+        move(scene, Motion(scale=1e-60))
+    at_origin = scene.with_tensors(means=torch.zeros(3, 3))
+    assert torch.equal(move(at_origin, Motion(scale=1e-60)).means, at_origin.means)
     infinite = scene.with_tensors({"means": torch.full((3, 3), torch.inf)}, {})
     assert move(infinite, Motion(scale=2.0)).means.isinf().all()
 

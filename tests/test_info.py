@@ -121,3 +121,9 @@ def test_a_device_gives_the_figures_of_the_cpu():
     with pretended_cuda():
         found = describe(scene.to("cuda"))
     assert found.mass_shares == pytest.approx(describe(scene).mass_shares, rel=1e-12)
+
+
+def test_tensors_that_require_gradients_give_the_same_figures():
+    scene = random_scene(100)
+    tensors = {name: rows.clone().requires_grad_() for name, rows in scene.tensors().items()}
+    assert describe(scene.with_tensors(tensors)) == describe(scene)

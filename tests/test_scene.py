@@ -12,6 +12,7 @@ import torch
 import cvtgs
 from cvtgs import GaussianScene
 from cvtgs.errors import DeviceError, InvalidArgumentError, InvalidSceneError, OutputExistsError
+from cvtgs.math.parameters import mean_projected_area
 from scenes import random_scene, same_bits
 
 INF = float("inf")
@@ -95,6 +96,11 @@ def test_scenes_are_indexed_like_tensors():
         scene[0.5]
     with pytest.raises(InvalidArgumentError, match=r"row numbers, found .{57}\.\.\.\.$"):
         scene[[0.5] * 1000]
+    with pytest.raises(InvalidArgumentError, match=r"tensor\(\[\[False\], \[False\], "):
+        scene[mask[:, None] & False]
+    for of_bytes in (mask.byte(), mask.byte().numpy()):
+        with pytest.raises(InvalidArgumentError, match="must be bool, and row numbers int32"):
+            scene[of_bytes]
     with pytest.raises(InvalidArgumentError, match="for each of 9 Gaussians, found 8"):
         scene[mask[:8]]
     for rows in ([9], [0, -10], torch.tensor([12])):
@@ -125,6 +131,21 @@ def test_masses_do_not_depend_on_chunks(monkeypatch):
     whole = scene.masses
     monkeypatch.setattr("cvtgs.scene._CHUNK", 7)
     assert torch.equal(scene.masses, whole)
+
+
+def test_areas_and_masses_are_differentiable(monkeypatch):
+    scenes = [
+        GaussianScene(**{name: rows.clone().requires_grad_() for name, rows in tensors.items()})
+        for tensors in [random_scene(50).tensors()] * 2
+    ]
+    monkeypatch.setattr("cvtgs.scene._CHUNK", 7)
+    scenes[0].masses.sum().backward()
+    scales, opacities = scenes[1].log_scales.double().exp(), scenes[1].opacities
+    (mean_projected_area(scales) * opacities).sum().backward()
+    for name in ("log_scales", "logit_opacities"):
+        torch.testing.assert_close(*(getattr(scene, name).grad for scene in scenes))
+    with torch.no_grad():
+        assert not scenes[0].masses.requires_grad
 
 
 def test_select_by_rows_and_by_mask():
@@ -225,8 +246,8 @@ def test_repr_shows_no_values():
 @pytest.mark.parametrize(
     ("name", "shape", "wanted"),
     [
-        ("means", (4, 2), "(4, 3)"),
-        ("means", (4,), "(4, 3)"),
+        ("means", (4, 2), "(n, 3)"),
+        ("means", (4,), "(n, 3)"),
         ("quats", (4, 3), "(4, 4)"),
         ("quats", (3, 4), "(4, 4)"),
         ("log_scales", (4, 1), "(4, 3)"),
@@ -276,8 +297,21 @@ def test_extra_columns_that_cannot_be_selected_from_are_errors():
     assert error_of(extras={"id": [1, 2, 3, 4]}) == f"{text}list."
 
 
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"comments": "SplatRenderMode: mip"}, "comments must be a tuple of texts, found 'Splat"),
+        ({"comments": (5,)}, "comments must be a tuple of texts, found (5,)."),
+        ({"extras": {5: torch.zeros(4)}}, "names of extra columns must be a tuple of texts, found"),
+        ({"extras": None}, "names of extra columns must be a tuple of texts, found None."),
+    ],
+)
+def test_comments_and_names_are_texts(changes, text):
+    assert error_of(**changes).startswith(text)
+
+
 def test_a_tensor_without_rows_is_an_error():
-    assert error_of(means=torch.tensor(1.0)) == "means must have shape (0, 3), found ()."
+    assert error_of(means=torch.tensor(1.0)) == "means must have shape (n, 3), found ()."
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda scene: pickle.loads(pickle.dumps(scene))])

@@ -2,16 +2,19 @@
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from types import UnionType
 from typing import Any
 
+import numpy as np
 import pydantic
 import torch
 from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 from torch import Tensor
 
-from cvtgs.errors import InvalidArgumentError, input_errors
+from cvtgs.errors import InvalidArgumentError, check_path, input_errors
 from cvtgs.text import MOST_LETTERS, shortened, shown
 
 __all__ = [
@@ -21,6 +24,9 @@ __all__ = [
 ]
 
 Corner = tuple[float, float, float]
+
+MaskLike = Bool[Tensor, "n"] | NDArray[np.bool_] | Sequence[bool]
+"""A mask of the Gaussians of a scene."""
 
 
 class Box(pydantic.BaseModel):
@@ -87,7 +93,7 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
     Raises:
         InputNotFoundError: There is no such file.
         InputError: The file cannot be read.
-        InvalidArgumentError: The file holds something else.
+        InvalidArgumentError: The file holds something else, or ``path`` is no path.
 
     Example:
         >>> import tempfile
@@ -97,6 +103,7 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
         ...     read_boxes(file)
         (Box(min=(0.0, 0.0, 0.0), max=(1.0, 2.0, 3.0)),)
     """
+    check_path(path)
     try:
         with input_errors(path):
             values = json.loads(Path(path).read_text(encoding="utf-8-sig"))
@@ -119,21 +126,28 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
     return boxes
 
 
-def inside(boxes: Sequence[Box], means: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+def inside(boxes: Sequence[Box] | Box, means: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
     """Return a mask of the centres that lie in any of some boxes.
 
     Args:
-        boxes: The boxes.
+        boxes: The boxes, or a single one.
         means: Positions, scene units.
 
     Returns:
         The mask.
+
+    Raises:
+        InvalidArgumentError: A box is something else, or positions are not of shape ``(n, 3)``.
 
     Example:
         >>> box = Box(min=(0, 0, 0), max=(1, 1, 1))
         >>> inside([box], torch.tensor([[0.5, 0.5, 1.0], [2.0, 0, 0]])).tolist()
         [True, False]
     """
+    boxes = listed(boxes, Box, required="boxes must be of type Box")
+    if not isinstance(means, Tensor) or means.ndim != 2 or means.shape[1] != 3:
+        shape = tuple(means.shape) if isinstance(means, Tensor) else type(means).__name__
+        raise InvalidArgumentError(f"means must be a tensor of shape (n, 3), found {shape}.")
     found = torch.zeros(len(means), dtype=torch.bool, device=means.device)
     for box in boxes:
         low, high = (means.new_tensor(corner) for corner in (box.min, box.max))
@@ -141,13 +155,29 @@ def inside(boxes: Sequence[Box], means: Float[Tensor, "n 3"]) -> Bool[Tensor, "n
     return found
 
 
-def check_mask(keep: Tensor, count: int) -> None:
-    """Raise unless a value is a mask of the ``count`` Gaussians of a scene."""
-    if not isinstance(keep, Tensor) or keep.dtype != torch.bool or keep.shape != (count,):
-        shape = f"{keep.dtype} {tuple(keep.shape)}" if isinstance(keep, Tensor) else repr(keep)
+def listed(values: Any, kinds: type | UnionType, *, required: str) -> list[Any]:
+    """Return one value, or several, as a list; raise unless all are of some kinds."""
+    several = isinstance(values, Iterable) and not isinstance(values, kinds)
+    found = list(values) if several else [values]
+    for value in found:
+        if not isinstance(value, kinds):
+            raise InvalidArgumentError(f"{required}, found {shown(value)}.")
+    return found
+
+
+def checked_mask(keep: MaskLike, count: int) -> Bool[Tensor, "n"]:
+    """Return a mask of the ``count`` Gaussians of a scene as a tensor; raise if it is none."""
+    mask: Tensor | None
+    try:
+        mask = keep if isinstance(keep, Tensor) else torch.from_numpy(np.array(keep, order="C"))
+    except (TypeError, ValueError, RuntimeError):  # no array, or not one of numbers
+        mask = None
+    if mask is None or mask.dtype != torch.bool or mask.shape != (count,):
+        found = shown(keep) if mask is None else f"{mask.dtype} {tuple(mask.shape)}"
         raise InvalidArgumentError(
-            f"keep must be a boolean tensor of shape ({count},), found {shape[:80]}."
+            f"keep must be a boolean tensor of shape ({count},), found {found}."
         )
+    return mask
 
 
 def check_room(kept: int, *, target: int, total: int) -> None:

@@ -1,18 +1,19 @@
 """Edits of scenes: crop, drop, move and merge. Unaffected values stay bit-identical."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from cvtgs.boxes import Box, Corner, inside
+from cvtgs.boxes import Box, Corner, inside, listed
 from cvtgs.devices import without_autocast
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn
 from cvtgs.math.parameters import multiply_quats, rotation_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS, rotated_rest
-from cvtgs.scene import NORMALS, GaussianScene, checked_scenes, concatenate, turned_normals
+from cvtgs.scene import NORMALS, GaussianScene, check_scene, checked_scenes, concatenate
 from cvtgs.text import shown
 
 __all__ = ["Motion", "Sphere", "crop", "drop_faint", "drop_large", "merge", "move"]
@@ -126,11 +127,18 @@ class Motion:
 def _numbers(values: Iterable[float], count: int) -> tuple[float, ...] | None:
     """Return finite numbers of any type as floats; None if they are others."""
     try:
-        listed = [] if isinstance(values, str | bytes) else list(values)
-        numbers = tuple(math.nan if isinstance(one, str) else float(one) for one in listed)
-    except (TypeError, ValueError, OverflowError, RuntimeError):  # a tensor of several numbers
+        numbers = () if isinstance(values, str | bytes) else tuple(map(_number, values))
+    except TypeError:  # a single value
         return None
     return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else None
+
+
+def _number(value: Any) -> float:
+    """Return a number of any type as a float; NaN if it is none."""
+    try:
+        return math.nan if isinstance(value, str | bytes) else float(value)
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # a tensor of several numbers
+        return math.nan
 
 
 def _cos_sin(degrees: float) -> tuple[float, float]:
@@ -151,7 +159,8 @@ def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -
         The kept Gaussians, in their order, bit for bit; the same object if all are kept.
 
     Raises:
-        InvalidArgumentError: There is no region, or one is neither a box nor a sphere.
+        InvalidArgumentError: There is no region, one is neither a box nor a sphere, or ``scene`` is
+            no scene.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -159,10 +168,8 @@ def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -
         >>> len(crop(scene, [Sphere(center=(0.0, 0.0, 0.0), radius=1e6)]))
         100
     """
-    regions = [regions] if isinstance(regions, Box | Sphere) else list(regions)
-    for region in regions:
-        if not isinstance(region, Box | Sphere):
-            raise InvalidArgumentError(f"regions must be boxes or spheres, found {shown(region)}.")
+    check_scene(scene)
+    regions = listed(regions, Box | Sphere, required="regions must be boxes or spheres")
     if not regions:
         raise InvalidArgumentError("crop needs at least one box or sphere, found none.")
     keep = inside([region for region in regions if isinstance(region, Box)], scene.means)
@@ -184,7 +191,7 @@ def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
         The others, in their order, bit for bit; the same object if none is dropped.
 
     Raises:
-        InvalidArgumentError: The opacity is not from 0 to 1.
+        InvalidArgumentError: The opacity is not from 0 to 1, or ``scene`` is no scene.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -192,9 +199,10 @@ def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
         >>> bool((drop_faint(scene, 0.5).opacities >= 0.5).all())
         True
     """
-    if not 0 <= least <= 1:
+    check_scene(scene)
+    if not 0 <= _number(least) <= 1:
         raise InvalidArgumentError(
-            f"the lowest opacity to keep must be from 0 to 1, found {least!r}."
+            f"the lowest opacity to keep must be from 0 to 1, found {shown(least)}."
         )
     # Opacities are not clamped here: clamped ones end at 1 - 1e-6 and never reach 1.
     return _kept(scene, ~(torch.sigmoid(scene.logit_opacities.double()) < least))
@@ -211,7 +219,7 @@ def drop_large(scene: GaussianScene, largest: float) -> GaussianScene:
         The others, in their order, bit for bit; the same object if none is dropped.
 
     Raises:
-        InvalidArgumentError: The size is not above 0.
+        InvalidArgumentError: The size is not above 0, or ``scene`` is no scene.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -219,8 +227,11 @@ def drop_large(scene: GaussianScene, largest: float) -> GaussianScene:
         >>> len(drop_large(scene, 1e6))
         100
     """
-    if not largest > 0:
-        raise InvalidArgumentError(f"the largest size to keep must be above 0, found {largest!r}.")
+    check_scene(scene)
+    if not _number(largest) > 0:
+        raise InvalidArgumentError(
+            f"the largest size to keep must be above 0, found {shown(largest)}."
+        )
     return _kept(scene, ~(scene.log_scales.double() > math.log(largest)).any(dim=1))
 
 
@@ -241,7 +252,8 @@ def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
         alone, a scale factor the centres and scales alone.
 
     Raises:
-        InvalidArgumentError: Coordinates would leave the range of the dtype.
+        InvalidArgumentError: Coordinates would leave the range of the dtype or shrink to 0, or an
+            argument has another type.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -249,6 +261,9 @@ def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
         >>> (move(one, Motion(shift=(1.0, 0.0, 0.0))).means - one.means).tolist()
         [[1.0, 0.0, 0.0]]
     """
+    check_scene(scene)
+    if not isinstance(motion, Motion):
+        raise InvalidArgumentError(f"motion must be a Motion, found {shown(motion)}.")
     means, changes, extras = scene.means.double(), {}, scene.extras
     quat = torch.tensor([motion.quat], dtype=torch.float64, device=scene.device)
     if bool((quat[0, 1:] != 0).any()):
@@ -261,6 +276,12 @@ def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
         extras = turned_normals(scene.extras, matrix)
     if motion.scale != 1.0:
         means = motion.scale * means
+        tiny = torch.finfo(scene.dtype).tiny
+        if bool((scene.means.abs() > 0).any()) and not bool((means.abs() >= tiny).any()):
+            raise InvalidArgumentError(
+                f"a motion must not shrink all coordinates below {tiny:.3g}, the range of "
+                f"{str(scene.dtype).removeprefix('torch.')}, found a scale of {motion.scale:g}."
+            )
         log_scales = scene.log_scales.double() + math.log(motion.scale)
         if scene.has_two_scales:  # the third one only says that Gaussians are flat
             log_scales[:, 2] = scene.log_scales[:, 2]
@@ -274,6 +295,16 @@ def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
             f"of {str(scene.dtype).removeprefix('torch.')}, found larger ones."
         )
     return scene.with_tensors({"means": moved, **changes}, extras)
+
+
+def turned_normals(extras: Mapping[str, Tensor], matrix: Tensor) -> dict[str, Tensor]:
+    """Return extra columns with their normals multiplied by a 3 x 3 matrix, if there are any."""
+    if not all(name in extras and extras[name].is_floating_point() for name in NORMALS):
+        return dict(extras)
+    normals = torch.stack([extras[name].double() for name in NORMALS], dim=1)
+    turned = normals @ matrix.to(normals).T
+    columns = {name: turned[:, k].to(extras[name].dtype) for k, name in enumerate(NORMALS)}
+    return {**extras, **columns}
 
 
 def merge(scenes: Iterable[GaussianScene]) -> GaussianScene:

@@ -157,6 +157,12 @@ def memory_errors(work: str, advice: str) -> Iterator[None]:
         raise OutOfMemoryError(f"{work} needs more memory than is available; {advice}.") from error
 
 
+def check_path(path: object) -> None:
+    """Raise unless a value can be the path of a file or folder."""
+    if not isinstance(path, str | os.PathLike):
+        raise InvalidArgumentError(f"a path must be a str or Path, found {type(path).__name__}.")
+
+
 @contextmanager
 def input_errors(path: str | os.PathLike[str]) -> Iterator[None]:
     """Turn system errors about a file into input errors of cvtgs."""

@@ -65,6 +65,7 @@ class SceneInfo(Record):
 HEAVIEST = (0.001, 0.01, 0.1, 0.5)
 
 
+@torch.no_grad()
 def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInfo:
     """Collect facts about a scene.
 

@@ -17,7 +17,7 @@ from cvtgs.analysis import (
     restore_columns,
     select_columns,
 )
-from cvtgs.boxes import check_mask, check_room
+from cvtgs.boxes import MaskLike, check_room, checked_mask
 from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
@@ -119,7 +119,7 @@ class Prepared:
         *,
         count: int | None = None,
         max_count: int | None = None,
-        keep: Bool[Tensor, "n"] | None = None,
+        keep: MaskLike | None = None,
     ) -> Simplified:
         """Simplify the scene, and report; arguments and errors as for ``Simplifier.run``.
 
@@ -128,9 +128,8 @@ class Prepared:
         """
         total = self._total
         target = target_count(total, rho, count=count, max_count=max_count)
-        if keep is not None:
-            check_mask(keep, total)
-        return self._attempt(partial(self._run, target, keep))
+        mask = None if keep is None else checked_mask(keep, total)
+        return self._attempt(partial(self._run, target, mask))
 
     def _attempt(self, compute: Callable[[torch.device, str], Result]) -> Result:
         """Compute on the device, or elsewhere if it lacks memory.

@@ -54,7 +54,7 @@ class GaussianScene:
             flat Gaussians.
 
     Raises:
-        InvalidSceneError: Shapes, dtypes or devices do not fit together.
+        InvalidSceneError: Shapes, dtypes or devices do not fit together, or a comment is no text.
 
     Example:
         >>> scene = GaussianScene(
@@ -93,7 +93,7 @@ class GaussianScene:
         shapes = (n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, bands, 3)
         for (name, tensor), shape in zip(tensors.items(), shapes, strict=True):
             if tuple(tensor.shape) != shape:
-                sizes = (n, "k", 3) if name == "shN" else shape
+                sizes = {"means": ("n", 3), "shN": (n, "k", 3)}.get(name, shape)
                 raise InvalidSceneError(
                     f"{name} must have shape ({', '.join(map(str, sizes))}), "
                     f"found {tuple(tensor.shape)}."
@@ -107,6 +107,10 @@ class GaussianScene:
             raise InvalidSceneError(
                 f"shN must hold 0, 3, 8 or 15 coefficients per channel, found {bands}."
             )
+        names = tuple(self.extras) if isinstance(self.extras, Mapping) else self.extras
+        for what, lines in (("comments", self.comments), ("names of extra columns", names)):
+            if not isinstance(lines, tuple | list) or not all(isinstance(x, str) for x in lines):
+                raise InvalidSceneError(f"{what} must be a tuple of texts, found {shown(lines)}.")
         for name, column in self.extras.items():
             found = getattr(column, "dtype", type(column).__name__)
             if not isinstance(column, Tensor) or found in _NOT_INDEXABLE:
@@ -194,8 +198,8 @@ class GaussianScene:
             A scene with a copy of those rows.
 
         Raises:
-            InvalidArgumentError: A mask has not one entry per Gaussian, or a number is out of range
-                (which is checked on a CPU only).
+            InvalidArgumentError: A mask has not one entry per Gaussian, a number is out of range
+                (which is checked on a CPU only), or ``rows`` are uint8.
         """
         rows = row_numbers(rows, len(self), things="Gaussians", device=self.device)
         return self.with_tensors(
@@ -331,6 +335,12 @@ SceneLike = GaussianScene | str | os.PathLike[str]
 """A scene, or the path of its file or folder."""
 
 
+def check_scene(scene: object) -> None:
+    """Raise unless a value is a scene."""
+    if not isinstance(scene, GaussianScene):
+        raise InvalidArgumentError(f"scene must be a GaussianScene, found {shown(scene)}.")
+
+
 def as_scene(scene: SceneLike, name: str = "scene") -> GaussianScene:
     """Return a scene unchanged, or read it from a path; raise for anything else."""
     if isinstance(scene, GaussianScene):
@@ -388,13 +398,3 @@ def concatenate(scenes: Iterable[GaussianScene]) -> GaussianScene:
         {name: torch.cat([each[name] for each in tensors]) for name in tensors[0]},
         {name: torch.cat([scene.extras[name] for scene in scenes]) for name in first.extras},
     )
-
-
-def turned_normals(extras: Mapping[str, Tensor], matrix: Tensor) -> dict[str, Tensor]:
-    """Return extra columns with their normals multiplied by a 3 x 3 matrix, if there are any."""
-    if not all(name in extras and extras[name].is_floating_point() for name in NORMALS):
-        return dict(extras)
-    normals = torch.stack([extras[name].double() for name in NORMALS], dim=1)
-    turned = normals @ matrix.to(normals).T
-    columns = {name: turned[:, k].to(extras[name].dtype) for k, name in enumerate(NORMALS)}
-    return {**extras, **columns}

@@ -35,12 +35,8 @@ def row_numbers(
         raise _error(rows, things) from None
     if picked.ndim != 1 and picked.numel():  # such as a single number
         raise _error(rows, things)
-    if picked.dtype == torch.bool:
-        if len(picked) != count:
-            raise InvalidArgumentError(
-                f"a mask must have an entry for each of {count:,} {things}, found {len(picked):,}."
-            )
-        return picked.nonzero()[:, 0]
+    if picked.dtype in (torch.bool, torch.uint8):
+        return _rows_of_mask(picked, count, things)
     if len(picked) and (picked.is_floating_point() or picked.is_complex()):
         raise _error(rows, things)
     if picked.dtype not in (torch.int32, torch.int64):
@@ -55,6 +51,18 @@ def row_numbers(
         if low >= 0:
             return picked
     return torch.where(picked < 0, picked + count, picked)
+
+
+def _rows_of_mask(mask: Tensor, count: int, things: str) -> Int[Tensor, "m"]:
+    if mask.dtype == torch.uint8:  # a mask in torch, row numbers in numpy
+        raise InvalidArgumentError(
+            f"a mask of {things} must be bool, and row numbers int32 or int64, found uint8."
+        )
+    if len(mask) != count:
+        raise InvalidArgumentError(
+            f"a mask must have an entry for each of {count:,} {things}, found {len(mask):,}."
+        )
+    return mask.nonzero()[:, 0]
 
 
 def _error(rows: object, things: str, hint: str = "") -> InvalidArgumentError:

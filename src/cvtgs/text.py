@@ -38,9 +38,9 @@ def _escaped(letter: str) -> str:
 
 
 def shown(value: Any, length: int = MOST_LETTERS) -> str:
-    """Return the ``repr`` of a value, truncated to a maximum length."""
+    """Return the ``repr`` of a value in one line, truncated to a maximum length."""
     try:
-        return shortened(repr(value), length)
+        return shortened(re.sub(r"\s*\n\s*", " ", repr(value)), length)
     except RecursionError:  # lists nested too deeply
         return f"a deeply nested {type(value).__name__}"
     except ValueError:  # Python refuses to print numbers of thousands of digits

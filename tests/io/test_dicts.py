@@ -172,6 +172,11 @@ def test_the_mapping_is_not_changed() -> None:
             False,
             "quats must have shape (2, 4), found (2, 3).",
         ),
+        (
+            {"means": torch.zeros(3, 2)},
+            False,
+            "means must have shape (n, 3), found (3, 2).",
+        ),
     ],
 )
 def test_bad_dictionaries_are_refused(changes: dict[str, Any], activated: bool, text: str) -> None:

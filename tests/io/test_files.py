@@ -4,7 +4,7 @@ import importlib
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +12,18 @@ import pytest
 import torch
 
 from cvtgs import load, load_cameras, save, to_dict
+from cvtgs.boxes import read_boxes
 from cvtgs.cli.main import main
 from cvtgs.errors import (
     FileFormatError,
     InputError,
     InputNotFoundError,
+    InvalidArgumentError,
+    OutputError,
 )
-from cvtgs.io import scene_file, scene_size
+from cvtgs.io import change_axes, check_output, check_save, losses, scene_file, scene_size
 from cvtgs.io.files import Document, _sentence
+from cvtgs.views import find_own_cameras
 from format_cases import DATA
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
 from scenes import random_scene
@@ -216,3 +220,44 @@ def test_every_key_of_a_document_has_an_error_message(kind: type[Document]) -> N
             text = _sentence(kind, {key: 0.5}, [key], "file")
             assert text.startswith(f"file: '{key}'")
             assert " must be " in text
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        scene_file,
+        check_save,
+        check_output,
+        load_cameras,
+        read_boxes,
+        lambda path: losses(random_scene(2), path),
+        lambda path: find_own_cameras(random_scene(2), path),
+    ],
+)
+def test_other_values_than_paths_are_refused(call: Callable[[Any], object]) -> None:
+    with pytest.raises(InvalidArgumentError, match="a path must be a str or Path, found NoneType"):
+        call(None)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        to_dict,
+        lambda scene: losses(scene, "a.sog"),
+        lambda scene: save(scene, "a.ply"),
+        lambda scene: change_axes(scene, "rdf", "rub"),
+        lambda scene: find_own_cameras(scene, "a.ply"),
+    ],
+)
+@pytest.mark.parametrize("value", [None, {}, "scene.ply"])
+def test_other_values_than_scenes_are_refused(call: Callable[[Any], object], value: object) -> None:
+    with pytest.raises(InvalidArgumentError, match="scene must be a GaussianScene, found"):
+        call(value)
+
+
+def test_folders_and_versions_of_other_formats_are_not_written(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="must be a file, found a directory"):
+        save(random_scene(2), f"{tmp_path}/new.ply/")
+    with pytest.raises(InvalidArgumentError, match=r"spz_version needs an \.spz to write, found"):
+        save(random_scene(2), tmp_path / "a.ply", spz_version=2)
+    assert not list(tmp_path.iterdir())

@@ -167,7 +167,7 @@ def test_arguments_of_another_kind_are_one_sentence(tmp_path):
     for wrong in (None, b"bytes"):
         with pytest.raises(InvalidArgumentError, match="from a path or an open binary file"):
             cvtgs.load(wrong)
-    with pytest.raises(InvalidArgumentError, match=r"found 'a\.ply' as scene"):
+    with pytest.raises(InvalidArgumentError, match=r"must be a GaussianScene, found 'a\.ply'"):
         cvtgs.save("a.ply", tmp_path / "z.ply")
 
 

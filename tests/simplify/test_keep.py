@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 
 import pytest
 import torch
@@ -52,10 +53,22 @@ def test_a_ratio_of_one_keeps_all_rows_and_kept_ones_come_first(scene):
     assert len(small) == 400
 
 
-@pytest.mark.parametrize("mask", [torch.ones(3, dtype=torch.bool), torch.ones(400), [True] * 400])
+@pytest.mark.parametrize(
+    "mask",
+    [torch.ones(3, dtype=torch.bool), torch.ones(400), [1] * 400, "all", [[True], [True, False]]],
+)
 def test_masks_that_do_not_fit_are_refused(scene, mask):
-    with pytest.raises(InvalidArgumentError, match=r"keep must be a boolean tensor of shape"):
+    with pytest.raises(InvalidArgumentError, match=r"keep must be a boolean tensor of shape.*\.$"):
         Simplifier(device="cpu").simplify(scene, 0.1, keep=mask)
+
+
+def test_masks_may_be_arrays_and_lists(scene):
+    mask = torch.arange(400) >= 390
+    wanted = Simplifier(device="cpu").simplify(scene, 0.1, keep=mask)
+    read_only = mask.numpy().copy()
+    read_only.flags.writeable = False
+    for alike in (read_only, mask.flip(0).numpy()[::-1], mask.tolist()):
+        assert same_bits(Simplifier(device="cpu").simplify(scene, 0.1, keep=alike), wanted)
 
 
 def test_invalid_rows_are_never_kept(scene):
@@ -116,6 +129,21 @@ def test_boxes_include_their_faces():
     points = torch.tensor([[0.0, 0, 0], [1, 1, 1], [1.0001, 0, 0], [-1, 0, 0]])
     assert inside([box], points).tolist() == [True, True, False, False]
     assert inside([], points).tolist() == [False] * 4
+    assert inside(box, points).tolist() == [True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("boxes", "points", "text"),
+    [
+        (None, torch.zeros(2, 3), "boxes must be of type Box, found None."),
+        ([(0, 1)], torch.zeros(2, 3), "boxes must be of type Box, found (0, 1)."),
+        ([], torch.zeros(2, 2), "means must be a tensor of shape (n, 3), found (2, 2)."),
+        ([], torch.zeros(2, 3).numpy(), "means must be a tensor of shape (n, 3), found ndarray."),
+    ],
+)
+def test_boxes_and_centres_are_checked(boxes, points, text):
+    with pytest.raises(InvalidArgumentError, match=re.escape(text)):
+        inside(boxes, points)
 
 
 @pytest.mark.parametrize("corners", [{"min": (1, 0, 0), "max": (0, 0, 0)}, {"min": (0, 0)}, {}])

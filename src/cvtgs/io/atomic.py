@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path, PureWindowsPath
 from typing import BinaryIO
 
-from cvtgs.errors import CvtgsError, OutputError, OutputExistsError, reason_of
+from cvtgs.errors import CvtgsError, OutputError, OutputExistsError, check_path, reason_of
 from cvtgs.text import shown
 
 try:
@@ -60,6 +60,7 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     check_output(Path(folder) / "new.ply")
     """
+    check_path(path)
     if "\0" in os.fspath(path):
         raise OutputError(f"{shown(path)}: the output must have a valid name, found a null byte.")
     target = _target(path)
@@ -69,7 +70,7 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
     try:
         if target.is_symlink():  # realpath follows all links but loops
             raise _refusal(path, "be a file", "a loop of symbolic links")
-        if target.is_dir():
+        if target.is_dir() or os.fspath(path).endswith(("/", os.sep)):
             raise _refusal(path, "be a file", "a directory")
         if (target.exists() and not target.is_file()) or _is_device(path):
             raise _refusal(path, "be a regular file", "a device or a pipe")

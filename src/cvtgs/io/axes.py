@@ -6,10 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.edit import turned_normals
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import multiply_quats
 from cvtgs.math.spherical_harmonics import rest_basis, rotated_rest
-from cvtgs.scene import GaussianScene, turned_normals
+from cvtgs.scene import GaussianScene, check_scene
 
 AXES = (
     *("ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf"),
@@ -57,7 +58,7 @@ def change_axes(scene: GaussianScene, source: str, target: str) -> GaussianScene
         The converted scene; the same object if the axes are the same.
 
     Raises:
-        InvalidArgumentError: The name of the axes is unknown.
+        InvalidArgumentError: The name of the axes is unknown, or ``scene`` is no scene.
 
     Example:
         >>> from cvtgs.synthetic import scene
@@ -65,6 +66,7 @@ def change_axes(scene: GaussianScene, source: str, target: str) -> GaussianScene
         >>> change_axes(one, "rdf", "rub").means / one.means
         tensor([[ 1., -1., -1.]])
     """
+    check_scene(scene)
     matrix = _matrix(checked_axes(target)) @ _matrix(checked_axes(source)).T
     if matrix[1, 1] == 0:  # y and z change places
         scene = _with_quarter_turn(scene)

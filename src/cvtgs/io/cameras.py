@@ -17,6 +17,7 @@ from cvtgs.errors import (
     FileFormatError,
     InputNotFoundError,
     InvalidArgumentError,
+    check_path,
     warn,
 )
 from cvtgs.io.files import is_file, is_folder, read_json
@@ -169,7 +170,8 @@ def load_cameras(path: str | os.PathLike[str], *, split: Split | None = None) ->
         The cameras, float64 on the CPU; their names are the image names or paths in the file.
 
     Raises:
-        InvalidArgumentError: The split does not exist, or the file is that of the other split.
+        InvalidArgumentError: The split does not exist, the file is that of the other split, or
+            ``path`` is no path.
         InputNotFoundError: The path does not exist, or the folder has none of these files.
         InputError: A file cannot be opened or read.
         FileFormatError: A file does not conform to its format, or has no camera of the split.
@@ -187,6 +189,7 @@ def load_cameras(path: str | os.PathLike[str], *, split: Split | None = None) ->
     """
     if split is not None and split not in SPLITS:
         raise InvalidArgumentError(f"split must be 'train', 'test' or None, found {split!r}.")
+    check_path(path)
     source = Path(path)
     views = _folder_views(source, split) if is_folder(source) else _file_views(source, split)
     if not views:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cvtgs.errors import InvalidSceneError, warn
 from cvtgs.math import parameters
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import GaussianScene, check_scene
 from cvtgs.text import shown
 
 _TENSORS = {
@@ -125,6 +125,9 @@ def to_dict(scene: GaussianScene) -> dict[str, Tensor]:
         (n,)`` as logits, ``sh0 (n, 1, 3)``, ``shN (n, k, 3)``; they share memory with the scene.
         Extra columns, comments and layout are left out.
 
+    Raises:
+        InvalidArgumentError: It is no scene.
+
     Example:
         >>> scene = from_dict({
         ...     "means": torch.zeros(2, 3), "quats": torch.ones(2, 4), "scales": torch.ones(2, 3),
@@ -133,6 +136,7 @@ def to_dict(scene: GaussianScene) -> dict[str, Tensor]:
         >>> list(to_dict(scene))
         ['means', 'quats', 'scales', 'opacities', 'sh0', 'shN']
     """
+    check_scene(scene)
     return {
         "means": scene.means,
         "quats": scene.quats,

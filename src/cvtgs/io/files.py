@@ -13,7 +13,14 @@ import pydantic
 from pydantic import AllowInfNan, BeforeValidator, Field, Strict
 from torch import Tensor
 
-from cvtgs.errors import FileFormatError, InputError, InputNotFoundError, input_errors, reason_of
+from cvtgs.errors import (
+    FileFormatError,
+    InputError,
+    InputNotFoundError,
+    check_path,
+    input_errors,
+    reason_of,
+)
 from cvtgs.text import shown
 
 _POINTER = b"version https://git-lfs."
@@ -81,11 +88,13 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
 
     Raises:
         InputError: The folder has none of these, or cannot be read.
+        InvalidArgumentError: It is no path.
 
     Example:
         >>> scene_file("scene.ply").name
         'scene.ply'
     """
+    check_path(path)
     folder = Path(path)
     if "\0" in str(folder):  # no system allows it
         raise InputNotFoundError(f"{shown(str(folder))}: the file to read must exist, found none.")

@@ -15,6 +15,7 @@ from cvtgs.errors import (
     DroppedDataWarning,
     FileFormatError,
     InvalidArgumentError,
+    check_path,
     memory_errors,
     warn,
 )
@@ -24,7 +25,7 @@ from cvtgs.io.files import is_file, scene_file
 from cvtgs.io.limits import FORMAT_LIMITS, Losses, losses_within
 from cvtgs.io.streams import ByteSink, ByteSource, file_of, name_of, written_to
 from cvtgs.math.spherical_harmonics import REST_COUNTS
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import GaussianScene, check_scene
 from cvtgs.text import shown
 
 _READERS: Mapping[str, str] = {
@@ -102,7 +103,8 @@ def load(
             the file. None detects it by the name, or by the first bytes of an open file.
         device: The device of the tensors.
         sh_degree: SH bands above this degree are set to zero; None keeps all. For plain PLY files
-            their columns are not even copied.
+            their columns are not even copied. The scene keeps the degree of the file, which
+            :meth:`cvtgs.GaussianScene.with_sh_degree` lowers.
         extras: Whether columns beyond the standard ones are kept; only plain PLY files have any.
         axes: The axes of the file, for example ``"rub"``, as :func:`cvtgs.io.change_axes` names
             them; the scene is converted to ``"rdf"``, the axes of PLY files. None uses those that
@@ -221,7 +223,8 @@ def save(
         OutputExistsError: The file exists and may not be replaced.
         OutputError: The file cannot be written (directory missing, no permission, disk full).
         InvalidSceneError: The format cannot represent the scene.
-        InvalidArgumentError: The axes or the version do not exist.
+        InvalidArgumentError: The axes or the version do not exist, a version is given for another
+            format, or an argument has another type.
 
     Example:
         >>> import tempfile
@@ -232,8 +235,7 @@ def save(
         ...     save(two, Path(folder) / "two.ply", overwrite=True)
     """
     output: AbstractContextManager[BinaryIO]
-    if not isinstance(scene, GaussianScene):
-        raise InvalidArgumentError(f"a scene is saved to a path, found {shown(scene)} as scene.")
+    check_scene(scene)
     if isinstance(path, str | os.PathLike):
         name, named = os.fspath(path), _dotted(format) or path
         output = atomic_output(path, overwrite=overwrite)
@@ -245,6 +247,8 @@ def save(
         name, named = name_of(path), _dotted(format) or ".ply"
         output = written_to(path)
     suffix = _suffix_of(named, _WRITERS, format=format)
+    if spz_version != 3 and suffix != ".spz":
+        raise InvalidArgumentError(f"spz_version needs an .spz to write, found {named}.")
     if isinstance(path, str | os.PathLike):
         check_output(path, overwrite)
     axes = axes or _FILE_AXES.get(suffix, SCENE_AXES)
@@ -271,12 +275,15 @@ def losses(scene: GaussianScene, path: str | os.PathLike[str]) -> Losses:
 
     Raises:
         FileFormatError: The format is unknown or cannot be written.
+        InvalidArgumentError: An argument has another type.
 
     Example:
         >>> from cvtgs.synthetic import scene
         >>> losses(scene("object", 10, sh_degree=1, seed=0), "small.splat").dropped
         ('SH bands above degree 0 (the scene has degree 1)',)
     """
+    check_scene(scene)
+    check_path(path)
     dotted = f".{os.fspath(path)}"
     named = dotted if dotted.lower() in _WRITERS else path
     limits = FORMAT_LIMITS.get(_suffix_of(named, _WRITERS))
@@ -302,6 +309,7 @@ def check_save(path: str | os.PathLike[str], overwrite: bool = False) -> None:
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     check_save(Path(folder) / "new.ply")
     """
+    check_path(path)
     _suffix_of(path, _WRITERS)
     check_output(path, overwrite)
 

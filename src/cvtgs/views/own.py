@@ -10,8 +10,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.errors import CvtgsError, FileFormatError, warn
-from cvtgs.scene import GaussianScene
+from cvtgs.errors import CvtgsError, FileFormatError, check_path, warn
+from cvtgs.scene import GaussianScene, check_scene
 
 _LEAST_SEEN = 0.01
 """A camera looks at a scene if its image contains this share of the visible Gaussians."""
@@ -60,6 +60,9 @@ def find_own_cameras(scene: GaussianScene, path: str | os.PathLike[str]) -> OwnC
     Returns:
         The cameras, at least two; None if there are none that fit.
 
+    Raises:
+        InvalidArgumentError: An argument has another type.
+
     Example:
         >>> import tempfile
         >>> from cvtgs.synthetic import scene as make
@@ -69,6 +72,8 @@ def find_own_cameras(scene: GaussianScene, path: str | os.PathLike[str]) -> OwnC
     """
     from cvtgs.io import load_cameras  # noqa: PLC0415 (a scene in memory needs no formats)
 
+    check_scene(scene)
+    check_path(path)
     place, faults = Path(path), set[str]()
     for source in _sources(place) if place.exists() else ():
         try:
