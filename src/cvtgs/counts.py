@@ -91,7 +91,7 @@ def target_count(
             )
         return number
     if rho is None or not _is_ratio(rho):
-        kind = "" if isinstance(rho, int | float) else "a number "
+        kind = "" if type(rho) in (int, float) else "a number "
         raise InvalidArgumentError(f"rho must be {kind}above 0 and at most 1; found {rho!r}.")
     near = round(float(rho) * total)
     if near and near / total == float(rho):  # for example that of a report
@@ -120,8 +120,11 @@ def check_share(value: object, name: str) -> None:
 
 
 def _number(value: object) -> float:
+    """Return a number as a float; NaN for anything else, such as texts and truth values."""
+    if isinstance(value, str | bytes | bytearray) or "bool" in type(value).__name__:
+        return math.nan
     try:
-        return math.nan if isinstance(value, str) else float(value)  # type: ignore[arg-type]
+        return float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor of several numbers
         return math.nan
 

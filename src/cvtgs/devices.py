@@ -3,6 +3,7 @@
 import gc
 import os
 import platform
+import re
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,6 +18,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from cvtgs.errors import DeviceError, OutOfMemoryError, is_out_of_memory
+from cvtgs.text import shortened
 
 LONGER_CHUNKS = 128
 """Maximum length of a chunk on other devices, as a multiple of its length on a CPU."""
@@ -62,11 +64,13 @@ def usable_device(device: str | torch.device) -> torch.device:
     try:
         resolved = torch.device(device)
         torch.empty(0, device=resolved)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).split("\n")[0].rstrip(".")
+    except (RuntimeError, AssertionError, NotImplementedError, ImportError) as error:
+        reason = shortened(re.split(r"\.?\n|\. |\.$", str(error))[0], 120)
         if reason.startswith("Expected one of"):  # all types that torch knows
-            reason = "torch has no such device; 'cpu' and 'cuda' are common ones"
-        raise DeviceError(f"device {str(device)!r} cannot be used here: {reason}.") from None
+            reason = "torch has no such device"
+        raise DeviceError(
+            f"device {str(device)!r} cannot be used here: {reason}; use another, such as 'cpu'."
+        ) from None
     return resolved
 
 

@@ -4,13 +4,12 @@ import os
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
+from cvtgs.boxes import MaskLike
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
 from cvtgs.devices import usable_device
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import DeviceError, InvalidArgumentError
 from cvtgs.mergenet.checkpoint import checkpoint_for
 from cvtgs.prepared import Prepared
 from cvtgs.progress import ProgressListener, silent
@@ -65,6 +64,8 @@ class Simplifier:
             preset="standard" if self.checkpoint is None else self.checkpoint.info.preset
         )
         self._device = None if device == "auto" else usable_device(device)
+        if self._device is not None and self._device.type == "meta":
+            raise DeviceError("device 'meta' cannot be used here: its tensors have no values.")
         self._listener = listener
 
     def __repr__(self) -> str:
@@ -80,7 +81,7 @@ class Simplifier:
         count: int | None = None,
         max_count: int | None = None,
         cameras: Cameras | None = None,
-        keep: Bool[Tensor, "n"] | None = None,
+        keep: MaskLike | None = None,
     ) -> GaussianScene:
         """Simplify a scene.
 
@@ -90,7 +91,8 @@ class Simplifier:
             count: Number of Gaussians to keep, instead of ``rho``.
             max_count: Maximum number to keep; a smaller scene is not reduced.
             cameras: Cameras for presets that render the scene; None finds or generates views.
-            keep: Mask of Gaussians to keep unchanged; they count towards the target and come first.
+            keep: Mask of Gaussians to keep unchanged: a tensor, an array or a list of bools. They
+                count towards the target and come first.
 
         Returns:
             A scene of exactly ``ceil(rho * N)`` (or the count) Gaussians; fewer only if invalid
@@ -111,7 +113,7 @@ class Simplifier:
         count: int | None = None,
         max_count: int | None = None,
         cameras: Cameras | None = None,
-        keep: Bool[Tensor, "n"] | None = None,
+        keep: MaskLike | None = None,
     ) -> Simplified:
         """Simplify a scene, and report; arguments and errors as for :meth:`simplify`.
 

@@ -195,7 +195,7 @@ def test_ratios_out_of_range_are_errors(rho):
     assert str(caught.value) == f"rho must be above 0 and at most 1; found {rho!r}."
 
 
-@pytest.mark.parametrize("rho", ["1%", "0.1", [0.1], torch.tensor([0.1, 0.2])])
+@pytest.mark.parametrize("rho", ["1%", "0.1", b"0.1", True, np.True_, [0.1], torch.ones(2)])
 def test_ratios_of_other_types_are_errors(rho):
     with pytest.raises(InvalidArgumentError, match="rho must be a number above 0 and at most 1"):
         target_count(5, rho)

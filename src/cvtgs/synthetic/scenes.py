@@ -6,6 +6,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
+from cvtgs.counts import whole_number
 from cvtgs.devices import one_thread
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.spherical_harmonics import REST_COUNTS
@@ -13,6 +14,7 @@ from cvtgs.scene import GaussianScene
 from cvtgs.synthetic.gaussians import Chunk
 from cvtgs.synthetic.layouts import LAYOUTS, Part
 from cvtgs.synthetic.textures import Random, noise_tile
+from cvtgs.text import shown
 
 KINDS = tuple(LAYOUTS)
 """The kinds of scenes that can be made."""
@@ -42,21 +44,24 @@ def scene(kind: str, count: int, *, sh_degree: int = 3, seed: int = 0) -> Gaussi
         A float32 scene of exactly ``count`` Gaussians on the CPU.
 
     Raises:
-        InvalidArgumentError: An argument is outside its range.
+        InvalidArgumentError: An argument is outside its range or of another type.
 
     Example:
         >>> scene("room", 1000, sh_degree=1, seed=7)
         GaussianScene(1,000 Gaussians, SH degree 1, float32, cpu)
     """
     if kind not in KINDS:
-        raise InvalidArgumentError(f"kind must be one of {', '.join(KINDS)}, found {kind!r}.")
+        raise InvalidArgumentError(f"kind must be one of {', '.join(KINDS)}, found {shown(kind)}.")
     for name, value, low, high in (
         ("count", count, 1, 2**40),
         ("sh_degree", sh_degree, 0, 3),
         ("seed", seed, 0, 2**63 - 1),
     ):
-        if not low <= value <= high:
-            raise InvalidArgumentError(f"{name} must be from {low} to {high}, found {value}.")
+        if not low <= whole_number(value) <= high:
+            raise InvalidArgumentError(
+                f"{name} must be a whole number from {low} to {high}, found {shown(value)}."
+            )
+    count, sh_degree, seed = map(whole_number, (count, sh_degree, seed))
     with _settings():
         generator = torch.Generator().manual_seed(seed)
         parts = LAYOUTS[kind](Random(generator=generator, tile=noise_tile(generator)))
@@ -80,7 +85,7 @@ def demo_scene(count: int = 200_000, *, sh_degree: int = 3, seed: int = 0) -> Ga
         A float32 scene of exactly ``count`` Gaussians on the CPU.
 
     Raises:
-        InvalidArgumentError: An argument is outside its range.
+        InvalidArgumentError: An argument is outside its range or of another type.
 
     Example:
         >>> len(demo_scene(1000))
