@@ -289,8 +289,14 @@ def test_wrong_values_are_refused_before_a_server_starts(
     assert "found 'nope'" in capsys.readouterr().err
 
 
-def test_a_missing_viser_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_missing_viser_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(MissingDependencyError, match=r'pip install "cvtgs\[view\]"'):
         ViewerServer(SceneViewer(random_scene(3)))
     assert main(["view", str(tmp_path / "missing.ply")]) == 1
+    assert "missing.ply: the file to read must exist" in capsys.readouterr().err
+    save(random_scene(3), tmp_path / "a.ply")
+    assert main(["view", str(tmp_path / "a.ply")]) == 1
+    assert 'pip install "cvtgs[view]"' in capsys.readouterr().err

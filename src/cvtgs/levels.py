@@ -15,6 +15,7 @@ from cvtgs.errors import FileFormatError, InvalidArgumentError
 from cvtgs.evaluation import Evaluation, SceneScores
 from cvtgs.evaluation.scorer import mean_of
 from cvtgs.io import atomic_output, check_output, check_save, load, save
+from cvtgs.io.atomic import make_folder
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.files import open_input
 from cvtgs.report import Level
@@ -165,6 +166,7 @@ def check_levels(
         for name in names:
             check_save(place.parent / f".{name}", overwrite=True)
         return
+    make_folder(place)  # raises for a file
     for name in names:
         check_save(place / name, overwrite=overwrite)
     check_output(place / INDEX_NAME, overwrite=overwrite)

@@ -87,8 +87,7 @@ def test_a_target_and_a_size_exclude_each_other(capsys):
         ),
         (
             ["--target-psnr", "30", "--time-budget", "2m"],
-            "--time-budget chooses the preset and cannot be used with --target-psnr and "
-            "--target-ssim.",
+            "--time-budget chooses the preset and cannot be used with --target-psnr.",
         ),
     ],
 )

@@ -84,6 +84,10 @@ def test_edits_use_the_axes_of_a_ply(tmp_path: Path, scene: GaussianScene) -> No
         (["--min-opacity", "2"], "--min-opacity must be from 0 to 1, found 2.0."),
         (["--max-size", "0"], "--max-size must be above 0, found 0.0."),
         (["--scale", "-1"], "--scale must be above 0 and finite, found -1.0."),
+        (
+            ["--scale", "1e-60"],
+            "a motion must not shrink all coordinates below 1.18e-38, the",
+        ),
         (["--rotate", "90"], "--rotate must be three numbers x,y,z, degrees about each axis, fou"),
         (["--translate", "nan,0,0"], "--translate must be three numbers x,y,z, found 'nan,0,0'"),
         (["--merge", "missing.ply"], "missing.ply: the file to read must exist, found none."),

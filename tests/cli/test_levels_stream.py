@@ -144,3 +144,9 @@ def test_cameras_beside_the_scene_are_read_only_if_levels_use_images(
     scored = ["--rho", "0.1", "--overwrite", "--views", "1", "--size", "32"]
     assert main([*words, *scored]) == 0
     assert capsys.readouterr().err.count("cameras are not used") == 1
+
+
+def test_levels_need_a_folder_to_write_to(tmp_path, capsys):
+    save(random_scene(30), tmp_path / "a.ply")
+    assert main(["levels", str(tmp_path / "a.ply"), "-o", str(tmp_path / "a.ply")]) == 1
+    assert "a.ply: must be a folder or a new path, found: file exists" in capsys.readouterr().err

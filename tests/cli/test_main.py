@@ -101,6 +101,34 @@ def test_without_a_command_the_help_is_printed(capsys):
             )
             for rho in ("150%", "0", "nan", "1.5")
         ),
+        *(
+            (
+                [command, "a.ply", "-o", "d", "--rho", "0.1,x"],
+                "argument --rho: must be different numbers separated by commas, for example "
+                "0.1,0.01 or 10%,1%; found '0.1,x'\n",
+            )
+            for command in ("levels", "tradeoff")
+        ),
+        (
+            ["levels", "a.ply", "-o", "d", "--rho", "0"],
+            "argument --rho: rho must be above 0 and at most 1 (100%), found '0'\n",
+        ),
+        (
+            ["simplify", "a.ply", "b.ply", "--rho", "1", "--workers", "x"],
+            "argument --workers: must be a whole number, found 'x'\n",
+        ),
+        (
+            ["simplify", "a.ply", "b.ply", "--rho", "1", "--refine-steps", "1.5"],
+            "argument --refine-steps: must be a whole number, found '1.5'\n",
+        ),
+        (
+            ["simplify", "a.ply", "b.ply", "--rho", "1", "--refine", "x"],
+            "argument --refine: must be a number, found 'x'\n",
+        ),
+        (
+            ["simplify", "a.ply", "b.ply", "--rho", "1", "--report", "d/"],
+            "argument --report: must be a file, found the folder 'd/'\n",
+        ),
         (["info", "a.ply", "b.ply"], "cvtgs info: error: unrecognized arguments: b.ply\n"),
         (
             ["levels", "a.ply", "-o", "l", "--rho", "0.1", "0.01"],

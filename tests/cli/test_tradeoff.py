@@ -63,11 +63,6 @@ def test_a_failed_run_is_reported_and_the_others_continue(source, tmp_path, caps
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (
-            ["--rho", "0.1,many"],
-            "--rho must be different numbers separated by commas, ",
-        ),
-        (["--rho", "2"], "rho must be above 0 and at most 1 (100%), found '2'."),
         (["--presets", "best"], "preset must be one of "),
         (["--views", "0"], "--views must be at least 1, found 0."),
     ],

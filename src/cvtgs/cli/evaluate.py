@@ -18,7 +18,7 @@ from cvtgs.cli.cameras import (
 )
 from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
 from cvtgs.cli.jobs import expanded
-from cvtgs.cli.options import CAMERA_FILES, AddParser, add_options, read_ratios, read_words
+from cvtgs.cli.options import CAMERA_FILES, AddParser, add_options, read_words
 from cvtgs.cli.view import PAGE, check_page, write_page
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import windows_fault
@@ -291,14 +291,13 @@ def tradeoff(options: argparse.Namespace) -> None:
 
     check_view_options(options)
     presets = None if options.presets is None else read_words(options.presets)
-    ratios = read_ratios(options.rho)
-    kept = tuple(task.file_name for task in tasks_of(presets, ratios) if options.save)
+    kept = tuple(task.file_name for task in tasks_of(presets, options.rho) if options.save)
     check_tradeoff_files(options.output, more=kept, overwrite=options.overwrite)
     with progress_bars(quiet=options.quiet) as listener:
         measured = cvtgs.tradeoff.measure_tradeoff(
             options.input,
             presets=presets,
-            ratios=ratios,
+            ratios=options.rho,
             cameras=lambda scene: choose_cameras(options, scene, most=MOST_CAMERAS, held_out=True),
             photographs=None if options.images is None else partial(read_photographs, options),
             settings=evaluation_settings(options),

@@ -74,7 +74,8 @@ def check_goals(options: argparse.Namespace) -> None:
         "--config": options.config is not None,
         "--ckpt": options.ckpt not in ("auto", "none"),
         "--refine": options.refine is not None or options.refine_steps is not None,
-        "--target-psnr and --target-ssim": has_target(options),
+        "--target-psnr": options.target_psnr is not None,
+        "--target-ssim": options.target_ssim is not None,
     }
     wrong = [name for name, is_given in excluded.items() if is_given]
     if wrong:

@@ -19,8 +19,8 @@ from cvtgs.cli.options import (
     checkpoint_of,
     dotted,
     preset_of,
+    ratios,
     read_axes,
-    read_ratios,
     read_settings,
 )
 from cvtgs.cli.streams import add_stream_options, check_stream_options, stream_blocks, stream_levels
@@ -51,6 +51,7 @@ def add_levels(add_parser: AddParser) -> None:
     add_options(parser, "input", "-o/--output")
     parser.add_argument(
         "--rho",
+        type=ratios,
         metavar="R,R",
         help="ratios of Gaussians to keep (default 0.1,0.01,0.001; with --stream "
         "1,0.25,0.06,0.015)",
@@ -79,7 +80,7 @@ def levels(options: argparse.Namespace) -> None:
     check_view_options(options)
     axes = read_axes(options.axes)
     default = PLAIN_RHOS if options.stream is None else STREAM_RHOS
-    rhos = sorted(read_ratios(options.rho or default), reverse=True)
+    rhos = sorted(options.rho or ratios(default), reverse=True)
     check_suffix(options.suffix)
     suffix = options.suffix or ".ply"
     names = cvtgs.levels.level_names(rhos, suffix)

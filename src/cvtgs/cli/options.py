@@ -28,6 +28,73 @@ READABLE = (
 WRITABLE = ".ply, .compressed.ply, .spz, .splat, .sog, .glb, .gltf, .spz.glb or .usda"
 PRESET_NAMES = "draft, fast, standard, matched, high (from the fastest to the best) or paper"
 CAMERA_FILES = "transforms.json, a COLMAP model, cameras.json, or a folder of these"
+
+
+def read_words(text: str) -> list[str]:
+    """Read comma-separated words."""
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def ratios(text: str) -> list[float]:
+    """Read a list of ratios, for argparse."""
+    from cvtgs.counts import read_ratio
+
+    words = read_words(text)
+    try:
+        numbers = [read_ratio(word) for word in words]
+    except InvalidArgumentError:
+        numbers = []
+    with _usage_errors():
+        for word, number in zip(words, numbers, strict=False):
+            _check_range(number, word)
+        if not numbers or len(set(numbers)) < len(numbers):
+            raise InvalidArgumentError(
+                f"must be different numbers separated by commas, for example 0.1,0.01 or 10%,1%; "
+                f"found {text!r}."
+            )
+    return numbers
+
+
+def ratio(text: str) -> float:
+    """Read a ratio, for argparse."""
+    from cvtgs.counts import read_ratio
+
+    with _usage_errors():
+        number = read_ratio(text)
+        _check_range(number, text)
+        return number
+
+
+def _check_range(number: float, text: str) -> None:
+    """Raise if a ratio is out of range; the message quotes the words that were typed."""
+    if not 0 < number <= 1:
+        raise InvalidArgumentError(f"rho must be above 0 and at most 1 (100%), found {text!r}.")
+
+
+def count(text: str) -> int:
+    """Read a number of Gaussians, for argparse."""
+    from cvtgs.counts import read_count
+
+    with _usage_errors():
+        return read_count(text)
+
+
+@contextmanager
+def _usage_errors() -> Iterator[None]:
+    """Raise invalid values as usage errors of argparse."""
+    try:
+        yield
+    except InvalidArgumentError as error:
+        raise argparse.ArgumentTypeError(str(error).rstrip(".")) from error
+
+
+def file(text: str) -> Path:
+    """Read the path of a file to write, for argparse."""
+    if text.endswith(("/", os.sep)):
+        raise argparse.ArgumentTypeError(f"must be a file, found the folder {text!r}")
+    return Path(text)
+
+
 # Keys are option names, with both spellings where there are two. Help texts of values are noun
 # phrases; those of flags begin with a verb.
 _SHARED: Mapping[str, Mapping[str, Any]] = {
@@ -42,6 +109,7 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     },
     "--rho": {
         "metavar": "R,R",
+        "type": ratios,
         "default": "0.1,0.01,0.001",
         "help": "ratios of Gaussians to keep (default 0.1,0.01,0.001)",
     },
@@ -179,6 +247,8 @@ class CommandParser(argparse.ArgumentParser):
         wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
         if wrong:
             message += suggestion(wrong[1], re.findall(r"[\w-]+", wrong[2]))
+        message = re.sub("invalid int value: ", "must be a whole number, found ", message)
+        message = re.sub("invalid float value: ", "must be a number, found ", message)
         lacks = re.fullmatch(r"argument (?:.*/)?(--[\w-]+): expected one argument", message)
         for option, value in pairwise(self._words):
             if lacks and option == lacks[1] and re.match(r"-[\d.]", value):
@@ -196,63 +266,6 @@ def add_options(parser: argparse.ArgumentParser, *names: str, **helps: str) -> N
         bare = name.lstrip("-")
         texts = {"help": helps[bare]} if bare in helps else {}
         parser.add_argument(*name.split("/"), **{**_SHARED[name], **texts})
-
-
-def read_words(text: str) -> list[str]:
-    """Read comma-separated words."""
-    return [word.strip() for word in text.split(",") if word.strip()]
-
-
-def read_ratios(text: str) -> list[float]:
-    """Read the list of ratios of ``--rho``."""
-    from cvtgs.counts import read_ratio
-
-    words = read_words(text)
-    try:
-        ratios = [read_ratio(word) for word in words]
-    except InvalidArgumentError:
-        ratios = []
-    for word, number in zip(words, ratios, strict=False):
-        _check_range(number, word)
-    if not ratios or len(set(ratios)) < len(ratios):
-        raise InvalidArgumentError(
-            f"--rho must be different numbers separated by commas, for example 0.1,0.01 or 10%,1%; "
-            f"found {text!r}."
-        )
-    return ratios
-
-
-def ratio(text: str) -> float:
-    """Read a ratio, for argparse."""
-    from cvtgs.counts import read_ratio
-
-    with _usage_errors():
-        number = read_ratio(text)
-        _check_range(number, text)
-        return number
-
-
-def _check_range(number: float, text: str) -> None:
-    """Raise if a ratio is out of range; the message quotes the words that were typed."""
-    if not 0 < number <= 1:
-        raise InvalidArgumentError(f"rho must be above 0 and at most 1 (100%), found {text!r}.")
-
-
-def count(text: str) -> int:
-    """Read a number of Gaussians, for argparse."""
-    from cvtgs.counts import read_count
-
-    with _usage_errors():
-        return read_count(text)
-
-
-@contextmanager
-def _usage_errors() -> Iterator[None]:
-    """Raise invalid values as usage errors of argparse."""
-    try:
-        yield
-    except InvalidArgumentError as error:
-        raise argparse.ArgumentTypeError(str(error).rstrip(".")) from error
 
 
 def dotted(text: str) -> str:

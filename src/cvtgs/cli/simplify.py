@@ -20,6 +20,7 @@ from cvtgs.cli.options import (
     check_written_files,
     checkpoint_of,
     count,
+    file,
     preset_of,
     ratio,
     read_axes,
@@ -33,6 +34,7 @@ from cvtgs.errors import (
     InvalidArgumentError,
     OutputError,
     OutputExistsError,
+    warn,
 )
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.text import counted
@@ -131,7 +133,7 @@ def add_simplify(add_parser: AddParser) -> None:
     )
     add_block_options(parser)
     parser.add_argument(
-        "--report", type=Path, metavar="R.json", help="file for a JSON report of the run"
+        "--report", type=file, metavar="R.json", help="file for a JSON report of the run"
     )
     add_options(parser, "--sh-degree", "--axes", "--lod", "--device", "--trust-sizes")
     add_options(parser, "--overwrite", "--quiet")
@@ -187,9 +189,10 @@ def _simplify_one(
         notes.insert(0, f"Seconds{of_what}: {', '.join(seconds)}.")
     if memory is None and options.memory is not None and _rows_of(options.input) is None:
         notes.append("In one piece: --memory has an effect on binary .ply files only.")
-    if options.keep is not None:
-        kept = counted(report.kept_count, "Gaussian") if report.kept_count else "No Gaussian"
-        notes.append(f"{kept} in the boxes of --keep.")
+    if report.kept_count:
+        notes.append(f"{counted(report.kept_count, 'Gaussian')} in the boxes of --keep.")
+    elif options.keep is not None:
+        warn(f"{options.keep}: no Gaussian is in the boxes of --keep, so none is protected.")
     total = time.perf_counter() - options.begun if searched else report.seconds
     return Outcome(
         f"{report.input_count:,} -> {counted(report.output_count, 'Gaussian')}",

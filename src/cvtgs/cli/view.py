@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import cvtgs
 from cvtgs.cli.display import say
 from cvtgs.cli.jobs import expanded
-from cvtgs.cli.options import PRESET_NAMES, AddParser, add_options, ratio
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.cli.options import PRESET_NAMES, AddParser, add_options, file, ratio
+from cvtgs.errors import InvalidArgumentError, input_errors
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -44,7 +44,7 @@ def add_view(add_parser: AddParser) -> None:
     )
     parser.add_argument(
         "--page",
-        type=Path,
+        type=file,
         metavar="F.html",
         help="write the page to a file that needs no server, instead of serving it; its time line "
         "switches between the scenes",
@@ -90,7 +90,6 @@ def view(options: argparse.Namespace) -> None:
     """Run ``cvtgs view``."""
     from cvtgs.viewer import SceneViewer, ViewerServer, check_viewer
 
-    check_viewer()
     preset = options.preset or "draft"
     cvtgs.SimplifyConfig.compose(preset=preset)
     if not 0 < options.port < 1 << 16:
@@ -99,6 +98,10 @@ def view(options: argparse.Namespace) -> None:
         cvtgs.io.check_output(options.page, options.overwrite)
     small = expanded(options.small)
     names = [options.input, *small]
+    for path in names:
+        with input_errors(path):
+            path.stat()
+    check_viewer()
     scene, *others = (cvtgs.load(path, trust_sizes=options.trust_sizes) for path in names)
     named = {str(path): other for path, other in zip(small, others, strict=True)}
     viewer = SceneViewer(scene, named, device=options.device)
