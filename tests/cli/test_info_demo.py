@@ -123,9 +123,11 @@ def test_demo_refuses_a_folder_that_cannot_be_created(tmp_path, capsys):
 
 
 def test_size_text():
-    assert [size_text(n) for n in (999, 1500, 68_000_000, 2_000_000_000)] == [
+    assert [size_text(n) for n in (999, 1500, 999_949, 999_999, 68_000_000, 2_000_000_000)] == [
         "999 B",
         "1.5 kB",
+        "999.9 kB",
+        "1.0 MB",
         "68.0 MB",
         "2.0 GB",
     ]

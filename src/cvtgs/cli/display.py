@@ -86,7 +86,7 @@ def size_text(count: int) -> str:
         return f"{count} B"
     value = count / 1000
     for unit in ("kB", "MB"):
-        if value < 1000:
+        if value < 999.95:  # else 1000.0
             return f"{value:.1f} {unit}"
         value /= 1000
     return f"{value:.1f} GB"

@@ -255,10 +255,10 @@ def bytes_text(count: int | None) -> str:
         return ""
     value, unit = float(count), "B"
     for larger in ("kB", "MB", "GB"):
-        if value < 1000:
+        if value < 999.5:  # else 1000
             break
         value, unit = value / 1000, larger
-    return f"{value:.0f} {unit}" if unit == "B" or value >= 100 else f"{value:.1f} {unit}"
+    return f"{value:.0f} {unit}" if unit == "B" or value >= 99.95 else f"{value:.1f} {unit}"
 
 
 def _ratio_text(ratio: float) -> str:

@@ -13,11 +13,11 @@
     if (value === null) return "";
     let unit = "B";
     for (const larger of ["kB", "MB", "GB"]) {
-      if (value < 1000) break;
+      if (value < 999.5) break; // else 1,000
       value /= 1000;
       unit = larger;
     }
-    return number(value, unit === "B" || value >= 100 ? 0 : 1) + " " + unit;
+    return number(value, unit === "B" || value >= 99.95 ? 0 : 1) + " " + unit;
   };
   const difference = (scene) => {
     const ratio = data.reference.count / Math.max(1, scene.count);
