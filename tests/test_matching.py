@@ -8,7 +8,9 @@ import torch
 
 import cvtgs
 from cvtgs import Simplifier, SimplifyConfig, matching
+from cvtgs.cells import Partition
 from cvtgs.config import MatchConfig
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.matching import (
     cell_contributions,
     fit_colors,
@@ -350,3 +352,48 @@ def test_errors_count_what_a_screen_can_show(scene, views):
     small = scene.with_tensors({"sh0": scene.sh0 + 40.0})
     shown = mean_squared_error(small, bright)
     assert shown < 1.0  # unclipped, colours differ by more than 5
+
+
+COUNT = "targets must be a tensor of one number for each of 1500 Gaussians, found "
+FROZEN = "frozen must be from 0 to 1500, the number of Gaussians; found "
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"targets": torch.ones(1)}, f"{COUNT}(1,)."),
+        ({"targets": torch.ones(1500, 1)}, f"{COUNT}(1500, 1)."),
+        ({"targets": None}, f"{COUNT}NoneType."),
+        (
+            {"targets": torch.ones(1500).index_fill(0, torch.tensor([7]), torch.nan)},
+            "targets must be at least 0; 1 of 1500 are not, the first is nan in row 7.",
+        ),
+        (
+            {"targets": -torch.ones(1500), "frozen": 3},
+            "targets must be at least 0; 1497 of 1500 are not, the first is -1.0 in row 3.",
+        ),
+        ({"frozen": 1501}, f"{FROZEN}1501."),
+        ({"frozen": -1}, f"{FROZEN}-1."),
+        (
+            {"views": ring(2)},
+            "views must be ObservedViews, as cvtgs.rendering.observe returns them; found Cameras.",
+        ),
+    ],
+)
+def test_arguments_that_do_not_fit_are_refused(scene, views, changes, text):
+    given = {"views": views, "targets": torch.ones(1500), "frozen": 0} | changes
+    config = MatchConfig(opacity_rounds=1, color_iterations=1)
+    frozen = given["frozen"]
+    with pytest.raises(InvalidArgumentError) as caught:
+        match_views(scene, given["views"], given["targets"], config=config, frozen=frozen)
+    assert str(caught.value) == text
+    if "targets" not in changes:
+        with pytest.raises(InvalidArgumentError, match=r"^(frozen|views) must be "):
+            fit_colors(scene, given["views"], config=config, frozen=frozen)
+
+
+def test_contributions_must_cover_all_members():
+    cells = Partition.from_labels(torch.tensor([1, 0, 1]), 2)
+    for wrong in (torch.ones(2), torch.ones(3, 1)):
+        with pytest.raises(InvalidArgumentError, match="at least the 3 in cells; found shape"):
+            cell_contributions(wrong, cells)

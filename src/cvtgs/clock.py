@@ -8,7 +8,17 @@ from contextlib import contextmanager
 import pydantic
 import torch
 
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
+from cvtgs.text import shown
+
+
+def check_listener(listener: object) -> None:
+    """Raise unless a listener can be called."""
+    if not callable(listener):
+        raise InvalidArgumentError(
+            f"listener must be a function of a progress event, found {shown(listener)}."
+        )
 
 
 class StageCost(pydantic.BaseModel):

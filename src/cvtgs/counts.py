@@ -156,6 +156,22 @@ def shortfall(valid: int, total: int, target: int) -> str:
     return f"only {valid} of {total} Gaussians are valid" if valid < target else ""
 
 
+def real_number(number: object) -> float:
+    """Return a number of any type, or NaN if it is none."""
+    try:
+        return math.nan if isinstance(number, str | bytes) else float(number)  # type: ignore[arg-type]
+    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor of several numbers
+        return math.nan
+
+
+def check_frozen(frozen: object, count: int) -> None:
+    """Raise unless a value is a number of Gaussians at the start of a scene."""
+    if not 0 <= whole_number(frozen) <= count:
+        raise InvalidArgumentError(
+            f"frozen must be from 0 to {count}, the number of Gaussians; found {shown(frozen)}."
+        )
+
+
 def shared_out(total: int, shares: Sequence[float], *, rooms: Sequence[int]) -> list[int]:
     """Split a count in proportion to shares by largest remainder, with an upper limit for each.
 

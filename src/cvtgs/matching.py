@@ -12,10 +12,13 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Partition
 from cvtgs.config import MatchConfig
+from cvtgs.counts import check_frozen
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import parameters
 from cvtgs.math.segments import segment_sum
 from cvtgs.math.spherical_harmonics import SH_C0, evaluate, rest_basis
 from cvtgs.rendering import BlendingWeights, ObservedViews, blending_weights, contributions, render
+from cvtgs.rendering.render import check_amounts, check_observed
 from cvtgs.report import MatchReport
 from cvtgs.scene import GaussianScene
 
@@ -99,8 +102,7 @@ def fit_colors(
     SH basis. The changes ``x`` of the coefficients minimize ``|A x - r|^2 + |L x|^2``, where ``r``
     is the residual of the images. The ridge ``L`` grows with the weight of a Gaussian and is
     stronger for view-dependent bands. Every eighth image is held out: if the full changes help
-    there, all images are used, else the changes are scaled down to the best step. This is our own
-    rule, not part of CVT-GS.
+    there, all images are used, else they are scaled down to the best step. Not part of CVT-GS.
 
     Memory: the blending weights of all images, and six times the colours.
 
@@ -112,6 +114,9 @@ def fit_colors(
 
     Returns:
         The scene with new colours; the same object if there are no iterations.
+
+    Raises:
+        InvalidArgumentError: ``views`` are no observed views, or ``frozen`` is out of range.
 
     Example:
         >>> from cvtgs.rendering import observe
@@ -125,6 +130,8 @@ def fit_colors(
         >>> bool((found.sh0 - scene.sh0).abs().median() < 0.05)
         True
     """
+    check_observed(views, "views")
+    check_frozen(frozen, len(small))
     if not config.color_iterations:
         return small
     linear = [
@@ -240,16 +247,24 @@ def cell_contributions(
 
     Args:
         contributions: Contribution of every Gaussian of the full scene, pixels.
-        partition: Members of every cell.
+        partition: Members of every cell; Gaussians in no cell are ignored.
 
     Returns:
         Contribution of every cell, pixels.
+
+    Raises:
+        InvalidArgumentError: There are fewer contributions than members.
 
     Example:
         >>> cells = Partition.from_labels(torch.tensor([1, 0, 1]), 2)
         >>> cell_contributions(torch.tensor([1.0, 2.0, 4.0]), cells).tolist()
         [2.0, 5.0]
     """
+    if contributions.ndim != 1 or len(contributions) < len(partition.order):
+        raise InvalidArgumentError(
+            f"contributions must be one number for each Gaussian, at least the "
+            f"{len(partition.order):,} in cells; found shape {tuple(contributions.shape)}."
+        )
     return segment_sum(contributions[partition.order], partition.offsets)
 
 
@@ -276,6 +291,9 @@ def match_views(
     Returns:
         The scene and the report.
 
+    Raises:
+        InvalidArgumentError: As for :func:`match_opacities` and :func:`fit_colors`.
+
     Example:
         >>> from cvtgs.rendering import observe
         >>> from cvtgs.synthetic import scene as make
@@ -286,9 +304,10 @@ def match_views(
         >>> match_views(scene, views, views.contributions, config=config).report.opacities_kept
         False
     """
+    check_observed(views, "views")
+    matched = match_opacities(small, views.cameras, targets, config=config, frozen=frozen)
     deciding = heldout_views(views)
     before = mean_squared_error(small, deciding)
-    matched = match_opacities(small, views.cameras, targets, config=config, frozen=frozen)
     helps = matched is not small and mean_squared_error(matched, deciding) < before
     colored = fit_colors(matched if helps else small, views, config=config, frozen=frozen)
     after = before if colored is small else mean_squared_error(colored, deciding)
@@ -325,17 +344,21 @@ def match_opacities(
     Returns:
         The scene with new opacities; the same object if there are no rounds.
 
+    Raises:
+        InvalidArgumentError: Targets have another shape or are below 0; ``frozen`` is too large.
+
     Example:
         >>> from cvtgs.synthetic import scene as make
         >>> from cvtgs.views import automatic_views
         >>> scene = make("object", 200, sh_degree=0, seed=0)
         >>> views = automatic_views(scene, 2, width=32, height=32)
         >>> wanted = 0.5 * contributions(scene, views)
-        >>> config = MatchConfig(opacity_rounds=8)
-        >>> found = match_opacities(scene, views, wanted, config=config)
+        >>> found = match_opacities(scene, views, wanted, config=MatchConfig(opacity_rounds=8))
         >>> bool(contributions(found, views).sum() < 1.2 * wanted.sum())
         True
     """
+    check_frozen(frozen, len(small))
+    check_amounts(targets, "targets", len(small), ignored=frozen)
     for _ in range(config.opacity_rounds):
         own = contributions(small, cameras)
         ratios = (targets + LEAST_PIXELS) / (own + LEAST_PIXELS)

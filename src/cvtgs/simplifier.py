@@ -7,6 +7,7 @@ import torch
 
 from cvtgs.boxes import MaskLike
 from cvtgs.cameras import Cameras
+from cvtgs.clock import check_listener
 from cvtgs.config import SimplifyConfig
 from cvtgs.devices import usable_device
 from cvtgs.errors import DeviceError, InvalidArgumentError
@@ -54,10 +55,7 @@ class Simplifier:
         device: str | torch.device = "auto",
         listener: ProgressListener = silent,
     ) -> None:
-        if not callable(listener):
-            raise InvalidArgumentError(
-                f"listener must be a function of a progress event, found {shown(listener)}."
-            )
+        check_listener(listener)
         chosen = _chosen_config(config, preset)
         self.checkpoint = checkpoint_for(ckpt, chosen)
         self.config = chosen or SimplifyConfig(

@@ -227,12 +227,13 @@ def test_huge_gaussians_have_finite_units(log_scale):
     assert all(tensor.isfinite().all() for tensor in optimizer.scene().tensors().values())
 
 
-def test_seeds_are_whole_numbers_of_any_type():
+def test_seeds_and_steps_are_whole_numbers_of_any_type():
     full = full_scene()
     small = discolored(full)
     options = {"steps": 2, "config": quick(), "device": "cpu"}
     wanted = refine(small, full, seed=3, **options).scene
-    assert same_bits(refine(small, full, seed=np.int64(3), **options).scene, wanted)
+    numbers = {"seed": np.int64(3), "steps": np.int64(2)}
+    assert same_bits(refine(small, full, **options | numbers).scene, wanted)
     for seed in (None, 0.5, "0"):
         with pytest.raises(
             InvalidArgumentError, match=f"seed must be a whole number, found {seed!r}"

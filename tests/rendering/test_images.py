@@ -2,11 +2,12 @@
 
 import math
 from dataclasses import replace
+from importlib.util import find_spec
 
 import pytest
 import torch
 
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import InvalidArgumentError, OutOfMemoryError
 from cvtgs.rendering import blending_weights, contributions, observe, render
 from render_cases import MIP, around, backends, dtypes, scene_of, straight
 from scenes import random_scene
@@ -208,6 +209,11 @@ def test_no_gaussians_and_none_in_view(backend):
             "background must be three numbers, or a tensor of shape (3,) or (1, 3), found 'white'.",
         ),
         (
+            {"background": (0.0, math.nan, 0.0)},
+            "background must be finite, found NaN or infinite numbers.",
+        ),
+        ({"listener": 5}, "listener must be a function of a progress event, found 5."),
+        (
             {"sh_degree": 2},
             "sh_degree must be from 0 to 1, the degree of the scene, found 2.",
         ),
@@ -255,3 +261,10 @@ def test_wrong_cameras_are_refused(backend, changes, wish):
     with pytest.raises(InvalidArgumentError) as caught:
         render(random_scene(3), replace(cameras, **changes), backend=backend)
     assert str(caught.value) == f"cameras must have {wish}; 1 of 1 do not, the first is camera 0."
+
+
+@pytest.mark.skipif(not find_spec("numba"), reason="needs numba")
+def test_images_larger_than_the_memory_are_refused():
+    huge = replace(straight(dtype=torch.float32), width=10**9, height=10**9)
+    with pytest.raises(OutOfMemoryError, match=r"^rendering 1 x 1,000,000,000 x .* needs more mem"):
+        render(random_scene(3), huge, backend="numba")

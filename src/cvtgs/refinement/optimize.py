@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cvtgs.analysis import ambient_visibility
 from cvtgs.config import Rates, RefineConfig
+from cvtgs.counts import real_number, whole_number
 from cvtgs.cvt import nearest_site
 from cvtgs.cvt.nearest import runs_of_equal
 from cvtgs.errors import InvalidArgumentError
@@ -45,12 +46,11 @@ _LEAST_ROOT = 1e-15
 
 def check_limits(seconds: float | None, *, steps: int | None) -> None:
     """Raise an error if seconds or steps are not positive."""
-    if seconds is not None and not 0 < seconds < math.inf:
+    if seconds is not None and not 0 < real_number(seconds) < math.inf:
         raise InvalidArgumentError(
             f"the refinement time in seconds must be above 0 and finite, found {seconds!r}."
         )
-    whole = isinstance(steps, int) and not isinstance(steps, bool)
-    if steps is not None and not (whole and steps >= 1):
+    if steps is not None and whole_number(steps) < 1:
         raise InvalidArgumentError(
             f"the number of refinement steps must be a whole number of at least 1, found {steps!r}."
         )
@@ -62,8 +62,8 @@ class Limits:
     def __init__(self, seconds: float | None, *, steps: int | None) -> None:
         self._start = time.perf_counter()
         self._last = self._start
-        self._seconds = seconds
-        self._steps = steps
+        self._seconds = None if seconds is None else float(seconds)  # also one of numpy
+        self._steps = None if steps is None else int(steps)
         self._slowest = {"step": 0.0, "check": 0.0}
         self.steps = 0
 

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import torch
 
 from cvtgs.cameras import Cameras, checked_cameras
-from cvtgs.clock import StageClock
+from cvtgs.clock import StageClock, check_listener
 from cvtgs.config import RefineConfig
-from cvtgs.counts import whole_number
+from cvtgs.counts import check_frozen
 from cvtgs.devices import chosen_device, without_autocast
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer, check_seen
@@ -16,6 +16,7 @@ from cvtgs.refinement.images import ImageBuffer, generated_views, shared_views, 
 from cvtgs.refinement.optimize import STAGE, Limits, check_limits, learning_rate_scales, optimize
 from cvtgs.rendering import ObservedViews
 from cvtgs.rendering.backends import choose_backend
+from cvtgs.rendering.render import check_observed
 from cvtgs.report import RefineReport, SimplifyReport
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.text import shown
@@ -107,11 +108,10 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         seconds = config.seconds or None
         steps = config.steps or (DEFAULT_STEPS if seconds is None else None)
     check_limits(seconds, steps=steps)
-    if not 0 <= whole_number(frozen) <= len(small):
-        raise InvalidArgumentError(
-            f"frozen must be from 0 to {len(small)}, the number of Gaussians; "
-            f"found {shown(frozen)}."
-        )
+    check_frozen(frozen, len(small))
+    check_listener(listener)
+    if observed is not None:
+        check_observed(observed, "observed")
     checked_seed(seed)
     seed = int(seed)  # also one of numpy
     place = chosen_device(device, small.device)

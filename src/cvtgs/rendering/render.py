@@ -8,9 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras, checked_cameras
+from cvtgs.clock import check_listener
 from cvtgs.counts import whole_number
 from cvtgs.devices import without_autocast
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import InvalidArgumentError, memory_errors
 from cvtgs.math import parameters
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.rendering.backends import BackendName, BlendingWeights, choose_backend
@@ -77,10 +78,12 @@ def render(
         The images.
 
     Raises:
-        InvalidArgumentError: A camera is no pinhole camera, the background has another shape,
-            the scene has no such SH degree, or there is no such backend.
+        InvalidArgumentError: A camera is no pinhole camera, the background has another shape or
+            is not finite, the scene has no such SH degree, there is no such backend, or the
+            listener cannot be called.
         DeviceError: The backend does not work on the scene's device.
         MissingDependencyError: The backend's package is missing.
+        OutOfMemoryError: There is not enough memory for the images.
 
     Example:
         >>> from cvtgs.cameras import look_at
@@ -95,10 +98,13 @@ def render(
     """
     scene = as_scene(scene)
     checked_cameras(cameras)
+    check_listener(listener)
     degree = _degree(scene, sh_degree)
     behind = _background(scene, cameras, background)
     name, chosen = choose_backend(backend, scene.device)
-    output = chosen.rasterize(scene, cameras, sh_degree=degree, listener=listener)
+    size = f"{len(cameras):,} x {cameras.width:,} x {cameras.height:,} pixels"
+    with memory_errors(f"rendering {size}", "render fewer or smaller images"):
+        output = chosen.rasterize(scene, cameras, sh_degree=degree, listener=listener)
     if behind is None:
         rgb = output.rgb.contiguous()
     else:
@@ -166,6 +172,33 @@ class ObservedViews:
     alpha: Float[Tensor, "c h w"]
     contributions: Float[Tensor, "n"]
     backend: str
+
+
+def check_observed(views: object, name: str) -> None:
+    """Raise unless a value holds observed views."""
+    if not isinstance(views, ObservedViews):
+        raise InvalidArgumentError(
+            f"{name} must be ObservedViews, as cvtgs.rendering.observe returns them; "
+            f"found {type(views).__name__}."
+        )
+
+
+def check_amounts(amounts: object, name: str, count: int, *, ignored: int = 0) -> None:
+    """Raise unless there is a number of at least 0 for every Gaussian but the first, ignored ones.
+
+    It waits for the device.
+    """
+    shape = tuple(amounts.shape) if isinstance(amounts, Tensor) else type(amounts).__name__
+    if not isinstance(amounts, Tensor) or shape != (count,):
+        raise InvalidArgumentError(
+            f"{name} must be a tensor of one number for each of {count} Gaussians, found {shape}."
+        )
+    wrong = (~(amounts[ignored:] >= 0)).nonzero()[:, 0].tolist()  # NaN too
+    if wrong:
+        raise InvalidArgumentError(
+            f"{name} must be at least 0; {len(wrong)} of {count} are not, the first is "
+            f"{float(amounts[ignored + wrong[0]])} in row {ignored + wrong[0]}."
+        )
 
 
 @torch.no_grad()
@@ -269,7 +302,7 @@ def _background(
     if background is None:
         return None
     try:
-        colors = torch.as_tensor(background, dtype=scene.dtype, device=scene.device)
+        colors = torch.as_tensor(background, dtype=scene.dtype)
         found = f"shape {tuple(colors.shape)}"
     except (TypeError, ValueError):
         colors, found = None, shown(background)
@@ -278,4 +311,6 @@ def _background(
             f"background must be three numbers, or a tensor of shape (3,) or ({len(cameras)}, 3), "
             f"found {found}."
         )
-    return colors.reshape(-1, 3)
+    if colors.device.type == "cpu" and not bool(colors.isfinite().all()):
+        raise InvalidArgumentError("background must be finite, found NaN or infinite numbers.")
+    return colors.to(scene.device).reshape(-1, 3)
