@@ -30,6 +30,12 @@ GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "h
             "viewmats and Ks must share device and dtype, found torch.float32 on cpu and "
             "torch.float64 on cpu.",
         ),
+        (
+            {"viewmats": torch.eye(4)},
+            "viewmats must be floats of shape (1, 4, 4), found torch.float32 of shape (4, 4).",
+        ),
+        ({"strides": 5}, "strides must hold one stride per camera, 1; found 5."),
+        ({"ignores_tag": 5}, "ignores_tag must hold one choice per camera, 1; found 5."),
         ({"width": 0}, "width must be a whole number above 0, found 0."),
         ({"height": 2.5}, "height must be a whole number above 0, found 2.5."),
         ({"strides": (0,)}, "every stride must be a whole number above 0, found 0."),
@@ -63,6 +69,7 @@ def test_invalid_cameras_are_refused(changes, text):
         (lambda camera: camera.interleaved(0), "stride must be a whole number above 0, found 0."),
         (lambda camera: camera.fitted(-5), "side must be a whole number above 0, found -5."),
         (lambda camera: camera.spread(-1), "count must be a whole number above 0, found -1."),
+        (lambda camera: camera.resized("a", 1), "width must be a whole number above 0, found 'a'."),
         (lambda camera: camera.resized(8.5, 6), "width must be a whole number above 0, found 8.5."),
     ],
 )
@@ -70,6 +77,33 @@ def test_sizes_that_are_no_whole_numbers_are_refused(work, text):
     with pytest.raises(InvalidArgumentError) as caught:
         work(Cameras(**GOOD))
     assert str(caught.value) == text
+
+
+@pytest.mark.parametrize(
+    "first", [(1,), 1, None, ("a", "b"), (0, 0, 0), (2, 0), (0, 5), (-1, 0), (0.5, 0)]
+)
+def test_first_pixels_beyond_the_stride_are_refused(first):
+    with pytest.raises(InvalidArgumentError) as caught:
+        Cameras(**GOOD).every(2, first=first)
+    text = f"first must be a column and a row from 0 to 1, found {first!r}."
+    assert str(caught.value) == text
+
+
+@pytest.mark.parametrize(
+    ("points", "found"),
+    [
+        (torch.zeros(3), "torch.float32, (3,)"),
+        (torch.zeros(5, 2), "torch.float32, (5, 2)"),
+        (torch.zeros(5, 3, dtype=torch.int64), "torch.int64, (5, 3)"),
+        (torch.zeros(5, 3).numpy(), "float32, ndarray"),
+        ([[0.0, 0.0, 1.0]], "no floats, list"),
+        (None, "no floats, NoneType"),
+    ],
+)
+def test_points_of_another_shape_are_refused(points, found):
+    with pytest.raises(InvalidArgumentError) as caught:
+        Cameras(**GOOD).shows_any(points)
+    assert str(caught.value) == f"points must be a tensor of floats (n, 3), found {found}."
 
 
 def test_every_second_pixel_by_hand():

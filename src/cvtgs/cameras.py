@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.counts import check_whole
+from cvtgs.counts import check_whole, whole_number
 from cvtgs.devices import usable_device
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.selection import row_numbers
@@ -52,16 +52,15 @@ class Cameras:
     ignores_tag: tuple[bool, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, tensor in (("viewmats", self.viewmats), ("Ks", self.Ks)):
-            if not isinstance(tensor, Tensor):
-                raise InvalidArgumentError(
-                    f"{name} must be a torch.Tensor, found {type(tensor).__name__}."
-                )
-        count = len(self.viewmats) if self.viewmats.ndim else 0
+        count = len(self.viewmats) if getattr(self.viewmats, "ndim", 0) == 3 else 1  # a guess
         for name, tensor, shape in (
             ("viewmats", self.viewmats, (count, 4, 4)),
             ("Ks", self.Ks, (count, 3, 3)),
         ):
+            if not isinstance(tensor, Tensor):
+                raise InvalidArgumentError(
+                    f"{name} must be a torch.Tensor, found {type(tensor).__name__}."
+                )
             if tuple(tensor.shape) != shape or not tensor.is_floating_point():
                 raise InvalidArgumentError(
                     f"{name} must be floats of shape {shape}, "
@@ -74,17 +73,18 @@ class Cameras:
             )
         for name in ("width", "height"):
             check_whole(getattr(self, name), name)
-        for stride in self.strides:
-            check_whole(stride, "every stride")
         for name, values, entry in (
             ("names", self.names, "name"),
             ("strides", self.strides, "stride"),
             ("ignores_tag", self.ignores_tag, "choice"),
         ):
-            if values and len(values) != count:
+            if not isinstance(values, Sequence) or len(values) not in (0, count):
+                found = len(values) if isinstance(values, Sequence) else shown(values)
                 raise InvalidArgumentError(
-                    f"{name} must hold one {entry} per camera, {count}; found {len(values)}."
+                    f"{name} must hold one {entry} per camera, {count}; found {found}."
                 )
+        for stride in self.strides:
+            check_whole(stride, "every stride")
 
     def __len__(self) -> int:
         """Return the number of cameras."""
@@ -163,7 +163,12 @@ class Cameras:
 
         Returns:
             Cameras with scaled intrinsics.
+
+        Raises:
+            InvalidArgumentError: A length is no whole number above 0.
         """
+        check_whole(width, "width")
+        check_whole(height, "height")
         factors = self.Ks.new_tensor([width / self.width, height / self.height, 1.0])
         return replace(self, Ks=self.Ks * factors[:, None], width=width, height=height)
 
@@ -201,15 +206,19 @@ class Cameras:
             Cameras of smaller images.
 
         Raises:
-            InvalidArgumentError: The stride is no whole number above 0.
+            InvalidArgumentError: The stride is no whole number above 0, or ``first`` does not fit.
         """
         check_whole(stride, "stride")
-        return self._strided(
-            stride,
-            self.Ks.new_tensor([first]),
-            width=-(-(self.width - first[0]) // stride),
-            height=-(-(self.height - first[1]) // stride),
+        starts = tuple(map(whole_number, first)) if isinstance(first, Sequence) else ()
+        if len(starts) != 2 or not all(0 <= start < stride for start in starts):
+            raise InvalidArgumentError(
+                f"first must be a column and a row from 0 to {stride - 1}, found {shown(first)}."
+            )
+        width, height = (
+            -((starts[0] - self.width) // stride),
+            -((starts[1] - self.height) // stride),
         )
+        return self._strided(stride, self.Ks.new_tensor([starts]), width=width, height=height)
 
     def interleaved(self, stride: int) -> Self:
         """Return cameras that see only every ``stride``-th pixel, with offsets that differ.
@@ -288,7 +297,14 @@ class Cameras:
 
         Returns:
             Whether a point is in front of a camera and within its image.
+
+        Raises:
+            InvalidArgumentError: ``points`` is no tensor of floats of this shape.
         """
+        shape = tuple(points.shape) if isinstance(points, Tensor) else type(points).__name__
+        if shape[1:] != (3,) or not points.is_floating_point():
+            found = f"{getattr(points, 'dtype', 'no floats')}, {shape}"
+            raise InvalidArgumentError(f"points must be a tensor of floats (n, 3), found {found}.")
         for view, intrinsics in zip(self.viewmats.to(points), self.Ks.to(points), strict=True):
             x, y, depth = intrinsics @ (view[:3, :3] @ points.T + view[:3, 3:])
             inside = (depth > 0) & (x >= 0) & (x <= self.width * depth)

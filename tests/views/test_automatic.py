@@ -296,3 +296,9 @@ def test_numbers_of_numpy_are_accepted():
 def test_random_views_need_a_whole_number_of_views(count):
     with pytest.raises(InvalidArgumentError, match=f"at least 0; found {count}"):
         random_views(random_scene(50), count, size=32, seed=0)
+
+
+@pytest.mark.parametrize("reach", [(1,), 1, None, (3, 1), (-1, 0), (0, math.nan), ("a", 2)])
+def test_random_views_need_a_range_of_distances(reach):
+    with pytest.raises(InvalidArgumentError, match="two ascending numbers of at least 0, found"):
+        random_views(random_scene(50), 2, size=32, seed=0, reach=reach)

@@ -65,8 +65,8 @@ def random_views(
         with 65 degrees.
 
     Raises:
-        InvalidArgumentError: The count or the seed is no whole number, the count is negative, or
-            the size is no whole number above 0.
+        InvalidArgumentError: The count or the seed is no whole number, the count is negative, the
+            size is no whole number above 0, or ``reach`` is no range.
         InvalidSceneError: The scene has no valid row, or is larger than 1e14 units.
 
     Example:

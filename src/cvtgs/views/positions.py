@@ -1,6 +1,7 @@
 """Plausible camera positions in a scene: above its floor, not inside matter, not behind clutter."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import index
 
@@ -9,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.counts import check_whole
+from cvtgs.counts import check_whole, real_number
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.text import shown
@@ -137,9 +138,17 @@ class CameraPositions:
 
         Returns:
             Good positions, moved by up to a twentieth of a radius along each axis if still good.
+
+        Raises:
+            InvalidArgumentError: ``reach`` does not consist of two ascending numbers from 0.
         """
+        ends = tuple(map(real_number, reach)) if isinstance(reach, Sequence) else ()
+        if len(ends) != 2 or not 0 <= ends[0] <= ends[1]:
+            raise InvalidArgumentError(
+                f"reach must be two ascending numbers of at least 0, found {shown(reach)}."
+            )
         generator = torch.Generator().manual_seed(seed)
-        low, high = reach
+        low, high = ends
         beyond = (low - self.distances).clamp_min(self.distances - high).clamp_min(0)
         within = (beyond <= beyond.amin()).nonzero()[:, 0]
         picked = within[torch.randint(len(within), (count,), generator=generator, device="cpu")]
