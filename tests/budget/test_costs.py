@@ -5,7 +5,7 @@ import math
 import pytest
 
 from cvtgs import SimplifyConfig
-from cvtgs.budget import CostModel, Work, choose_preset, shipped_model
+from cvtgs.budget import CostModel, Work, choose_preset, cost_model, shipped_model
 from cvtgs.budget.calibrate import TRIALS
 from cvtgs.budget.costs import Measurement, fit_rates
 from cvtgs.errors import InvalidArgumentError
@@ -100,6 +100,65 @@ def test_a_scene_that_stays_whole_is_only_checked_and_analysed():
     whole = Work(count=2_000_000, target=2_000_000, colors=48)
     assert set(shipped_model().stage_seconds(whole, preset("high"))) == {"check", "plan"}
     assert choose_preset(whole, 20.0, model=shipped_model()).preset == "high"
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"rates": None}, "rates: input should be a valid dictionary, found None."),
+        (
+            {"rates": {"check": {"in": -1}}},
+            "rates.check.in: input should be greater than or equal to 0, found -1.",
+        ),
+        ({"rates": {"check": {"in": math.nan}}}, "should be a finite number, found nan."),
+        ({"rates": {"draft": {"check": 1.0}}}, "rates.draft must be of once, in, out; found 'ch"),
+        ({"rates": {"plan": {"out": 1.0}}}, "rates.plan must be of once, in; found 'out'."),
+    ],
+)
+def test_cost_models_of_other_values_are_refused(values, text):
+    with pytest.raises(InvalidArgumentError) as caught:
+        CostModel(**values)
+    assert str(caught.value).startswith("cost model: ")
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "text"),
+    [
+        ({"count": -1}, "count must be a whole number above 0, found -1."),
+        ({"count": 1.5}, "count must be a whole number above 0, found 1.5."),
+        ({"count": "a"}, "count must be a whole number above 0, found 'a'."),
+        ({"target": 11}, "target must be a whole number from 1 to the count, 10; found 11."),
+        ({"target": 0}, "target must be a whole number from 1 to the count, 10; found 0."),
+        ({"colors": 0}, "colors must be 3, 12, 27 or 48, found 0."),
+    ],
+)
+def test_work_of_other_sizes_is_refused(sizes, text):
+    with pytest.raises(InvalidArgumentError) as caught:
+        Work(**{"count": 10, "target": 1} | sizes)
+    assert str(caught.value) == text
+
+
+@pytest.mark.parametrize(
+    ("work", "seconds", "model", "text"),
+    [
+        (Work(count=9, target=1), "20s", None, "the time must be above 0 and finite, found '20s'"),
+        ("scene.ply", 9.0, None, "work must be a GaussianScene or a Work, found 'scene.ply'."),
+        (None, 9.0, None, "work must be a GaussianScene or a Work, found None."),
+        (Work(count=9, target=1), 9.0, {}, "model must be a CostModel with rates, found {}."),
+        (Work(count=9, target=1), 9.0, CostModel(rates={}), "with rates, found CostModel(rates={}"),
+    ],
+)
+def test_arguments_of_another_type_are_refused(work, seconds, model, text):
+    with pytest.raises(InvalidArgumentError) as caught:
+        choose_preset(work, seconds, model=model)
+    assert text in str(caught.value)
+
+
+def test_the_cache_folder_may_be_a_text(tmp_path):
+    made = cost_model(folder=str(tmp_path), calibration=shipped_model)
+    assert cost_model(folder=tmp_path, calibration=pytest.fail) == made
 
 
 def test_no_setting_may_name_the_preset_that_a_budget_chooses():

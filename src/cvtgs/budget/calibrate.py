@@ -135,7 +135,7 @@ def cost_model(
     *,
     recalibrate: bool = False,
     calibration: Calibration | None = None,
-    folder: Path | None = None,
+    folder: str | os.PathLike[str] | None = None,
     listener: ProgressListener = silent,
 ) -> CostModel:
     """Return the cost of presets on this machine; the first call measures and caches it.
@@ -196,7 +196,9 @@ def shipped_model() -> CostModel:
     return CostModel.model_validate_json(text)
 
 
-def is_calibrated(device: str | torch.device = "auto", *, folder: Path | None = None) -> bool:
+def is_calibrated(
+    device: str | torch.device = "auto", *, folder: str | os.PathLike[str] | None = None
+) -> bool:
     """Check whether the cost model of this machine is cached."""
     key = machine_key(chosen_device(device))
     return _read_cached(_cache_path(key, folder), key) is not None
@@ -228,8 +230,8 @@ def cache_folder() -> Path:
     return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "cvtgs"
 
 
-def _cache_path(key: Mapping[str, str], folder: Path | None) -> Path:
-    return (folder or cache_folder()) / f"cost-{_digest(key)}.json"
+def _cache_path(key: Mapping[str, str], folder: str | os.PathLike[str] | None) -> Path:
+    return Path(folder or cache_folder()) / f"cost-{_digest(key)}.json"
 
 
 def _digest(value: object) -> str:

@@ -3,17 +3,20 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import pydantic
 
 from cvtgs.cells.partition import MOST_SAMPLED
 from cvtgs.config import SimplifyConfig
-from cvtgs.config.base import Record
+from cvtgs.config.base import Record, explain, named
+from cvtgs.counts import check_whole, whole_number
 from cvtgs.cvt.tessellate import MIN_SAMPLES
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.grouping import finer_count
 from cvtgs.scene import GaussianScene
+from cvtgs.text import shown
 
 CHECK, PLAN = "check", "plan"
 VISIBILITY, NETWORK, MATCH, REFINE = "visibility", "network", "match", "refine"
@@ -49,6 +52,9 @@ PRIOR_WEIGHT = 0.3
 """Weight of each prior rate in a fit, in measurements."""
 
 
+COLORS = tuple(3 * (degree + 1) ** 2 for degree in range(4))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Work:
     """The size of a simplification.
@@ -57,11 +63,26 @@ class Work:
         count: Number of input Gaussians, N.
         target: Number of output Gaussians, M.
         colors: Number of colour coefficients of a Gaussian: 3, 12, 27 or 48.
+
+    Raises:
+        InvalidArgumentError: A number is out of range or no whole number.
     """
 
     count: int
     target: int
     colors: int = 3
+
+    def __post_init__(self) -> None:
+        check_whole(self.count, "count")
+        if not 1 <= whole_number(self.target) <= self.count:
+            raise InvalidArgumentError(
+                f"target must be a whole number from 1 to the count, {self.count:,}; "
+                f"found {shown(self.target)}."
+            )
+        if whole_number(self.colors) not in COLORS:
+            raise InvalidArgumentError(
+                f"colors must be 3, 12, 27 or 48, found {shown(self.colors)}."
+            )
 
     @classmethod
     def of(cls, scene: GaussianScene, target: int) -> Self:
@@ -155,12 +176,35 @@ class CostModel(Record, allow_inf_nan=False):
         start: Additional seconds of the first simplification of a process, for loading libraries.
         image_start: The same for libraries that only configurations with images need.
         trials: Seconds of the trials of a calibration, by name of the trial and by stage.
+
+    Raises:
+        InvalidArgumentError: A value is negative or not finite, or a stage has no such feature.
     """
 
     rates: dict[str, dict[str, pydantic.NonNegativeFloat]]
     start: pydantic.NonNegativeFloat = 0.0
     image_start: pydantic.NonNegativeFloat = 0.0
     trials: dict[str, dict[str, pydantic.NonNegativeFloat]] = pydantic.Field(default_factory=dict)
+
+    def __init__(self, /, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except pydantic.ValidationError as error:
+            raise InvalidArgumentError(f"cost model: {explain(error)}") from None
+
+    # Models in cache files are checked without a call of __init__, so damaged ones are replaced.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
+    @pydantic.model_validator(mode="after")
+    def _of_known_features(self) -> Self:
+        for stage, rates in self.rates.items():
+            known = FEATURES.get(stage, OTHER_FEATURES)
+            for name in rates:
+                if name not in known:
+                    raise ValueError(
+                        f"rates.{named(stage)} must be of {', '.join(known)}; found {shown(name)}"
+                    )
+        return self
 
     @classmethod
     def fit(

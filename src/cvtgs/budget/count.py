@@ -9,15 +9,16 @@ from typing import Literal, NamedTuple
 
 from cvtgs.budget.calibrate import CANDIDATES, cost_model
 from cvtgs.budget.costs import CostModel, Work
-from cvtgs.cameras import Cameras
+from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.config import SimplifyConfig
-from cvtgs.counts import target_count
+from cvtgs.counts import real_number, target_count
 from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.evaluation.scorer import MOST_PSNR, Metrics, Scorer, scene_scores
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import Simplified, SimplifyReport
 from cvtgs.scene import GaussianScene, SceneLike
 from cvtgs.simplifier import Simplifier
+from cvtgs.text import shown
 from cvtgs.views import automatic_views
 
 STAGE = "search"
@@ -98,13 +99,13 @@ class Target(NamedTuple):
 def checked_target(psnr: float | None, *, ssim: float | None) -> Target:
     """Return the quality to reach; raise if no scene can have it."""
     if psnr is not None and ssim is None:
-        if not 0 < psnr <= MOST_PSNR:
+        if not 0 < real_number(psnr) <= MOST_PSNR:
             raise InvalidArgumentError(
                 f"the PSNR to reach must be above 0 and at most {MOST_PSNR:g} dB, found {psnr!r}."
             )
         return Target("psnr", psnr)
     if ssim is not None and psnr is None:
-        if not 0 < ssim < 1:
+        if not 0 < real_number(ssim) < 1:
             raise InvalidArgumentError(
                 f"the SSIM to reach must be above 0 and below 1, found {ssim!r}."
             )
@@ -149,8 +150,8 @@ def find_count(
     Raises:
         GoalError: Even nine tenths of the Gaussians do not reach it; the message names the best
             result.
-        InvalidArgumentError: Both or neither are given, one is out of range, or ``heldout`` is
-            empty.
+        InvalidArgumentError: Both or neither are given, one is out of range, ``heldout`` is empty,
+            or an argument has another type.
         InvalidSceneError: The scene has no valid row.
 
     Example:
@@ -163,6 +164,8 @@ def find_count(
         True
     """
     target = checked_target(psnr, ssim=ssim)
+    if simplifier is not None and not isinstance(simplifier, Simplifier):
+        raise InvalidArgumentError(f"simplifier must be a Simplifier, found {shown(simplifier)}.")
     simplifier = simplifier or Simplifier()
     prepared = simplifier.prepare(scene, cameras=cameras)
     total, full = len(prepared.scene), prepared.scene
@@ -211,7 +214,7 @@ def find_count(
 
 def heldout_scorer(full: GaussianScene, cameras: Cameras, *, listener: ProgressListener) -> Scorer:
     """Return a scorer against the full scene over held-out views."""
-    total = len(cameras)
+    total = len(checked_cameras(cameras))
     if total == 0:
         raise InvalidArgumentError("heldout must hold at least one camera, found none.")
     return Scorer(
@@ -315,7 +318,8 @@ def choose_preset(
 
     Raises:
         GoalError: Not even the fastest preset fits; the message says how long it takes.
-        InvalidArgumentError: Seconds, ratio or count are out of range.
+        InvalidArgumentError: Seconds, ratio or count are out of range, or an argument has another
+            type.
         ConfigError: A setting is unknown or out of range.
 
     Example:
@@ -324,7 +328,7 @@ def choose_preset(
         >>> choose_preset(work, 9.0, model=CostModel(rates=rates))
         Choice(preset='standard', seconds=4.0)
     """
-    if not 0 < seconds < math.inf:
+    if not 0 < real_number(seconds) < math.inf:
         raise InvalidArgumentError(f"the time must be above 0 and finite, found {seconds!r} s.")
     if settings and "preset" in settings:
         raise InvalidArgumentError(
@@ -333,8 +337,12 @@ def choose_preset(
         )
     if isinstance(work, GaussianScene):
         work = Work.of(work, target_count(len(work), rho, count=count))
+    elif not isinstance(work, Work):
+        raise InvalidArgumentError(f"work must be a GaussianScene or a Work, found {shown(work)}.")
     elif rho is not None or count is not None:
         raise InvalidArgumentError("rho and count are for a scene only; a Work has its target.")
+    if model is not None and not (isinstance(model, CostModel) and model.rates):
+        raise InvalidArgumentError(f"model must be a CostModel with rates, found {shown(model)}.")
     known = cost_model() if model is None else model
     costs = {
         name: known.seconds(work, SimplifyConfig.compose(preset=name, settings=settings))
