@@ -170,7 +170,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("loss", [*LOSSES, relative_loss])
 def test_error_texts(loss, case) -> None:
     images, text = WRONG[case]
     with pytest.raises(InvalidArgumentError) as error:

@@ -223,6 +223,7 @@ def relative_loss(
         >>> round(relative_loss(grey, white, image_weight=0.0).item(), 3)
         -0.693
     """
+    check_pair(prediction, target)
     loss = prediction.new_zeros(())
     if squared_weight:
         squared = (prediction - target).square().mean()

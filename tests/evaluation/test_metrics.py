@@ -13,6 +13,7 @@ from cvtgs.evaluation import (
     Score,
     alpha_bias,
     alpha_error,
+    compare,
     evaluate,
     psnr,
     ssim,
@@ -143,6 +144,8 @@ def test_alpha_error_and_bias_equal_those_by_hand() -> None:
 
 def test_alpha_that_does_not_fit_is_refused() -> None:
     alpha = torch.zeros(1, 2, 3)
+    with pytest.raises(InvalidArgumentError, match="nothing empty, found None"):
+        alpha_error(None, alpha)
     for other in (alpha.double(), torch.zeros(1, 3, 2)):
         with pytest.raises(InvalidArgumentError, match="must share shape, dtype and device"):
             alpha_error(alpha, other)
@@ -162,6 +165,24 @@ def test_names_of_scenes_are_texts():
     scene = random_scene(3)
     with pytest.raises(InvalidArgumentError, match="names of scenes must be texts, found 1"):
         evaluate(scene, {1: scene}, automatic_views(scene, 1, width=32, height=32))
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"settings": {}}, "settings must be EvaluationSettings, found {}."),
+        ({"listener": 5}, "listener must be a function of a progress event, found 5."),
+        ({"sizes": {"b": 1}}, "sizes must be those of full, a; found one of 'b'."),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(options, text):
+    scene = random_scene(30)
+    cameras = automatic_views(scene, 1, width=32, height=32)
+    with pytest.raises(InvalidArgumentError) as caught:
+        compare(scene, {"a": scene}, cameras, **options)
+    assert str(caught.value) == text
+    with pytest.raises(InvalidArgumentError, match="backend must be one of auto, torch"):
+        EvaluationSettings(backend="x")
 
 
 def test_a_score_of_no_views_is_refused():

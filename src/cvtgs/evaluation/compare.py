@@ -10,6 +10,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from cvtgs.cameras import Cameras, checked_cameras, spread_rows
+from cvtgs.clock import check_listener
+from cvtgs.counts import check_whole
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation.images import as_bytes
 from cvtgs.evaluation.scorer import (
@@ -164,7 +166,8 @@ def compare(  # noqa: PLR0913 (options by name)
         The images and the scores.
 
     Raises:
-        InvalidArgumentError: As for :func:`evaluate`, or ``most_images`` is below 1.
+        InvalidArgumentError: As for :func:`evaluate`, ``most_images`` is below 1, or ``sizes``
+            names another scene.
         DeviceError: The backend does not work on a scene's device.
         MissingDependencyError: The backend's package or the chosen LPIPS is missing.
 
@@ -176,9 +179,14 @@ def compare(  # noqa: PLR0913 (options by name)
         >>> compare(scene, {"same": scene}, cameras).full.colors.shape
         (2, 24, 32, 3)
     """
-    if most_images is not None and most_images < 1:
-        raise InvalidArgumentError(f"most_images must be at least 1, found {most_images}.")
+    if most_images is not None:
+        check_whole(most_images, "most_images")
     scenes = _named_scenes(reference, small, reference_name)
+    for name in sizes or {}:
+        if name not in scenes:
+            raise InvalidArgumentError(
+                f"sizes must be those of {', '.join(scenes)}; found one of {shown(name)}."
+            )
     views = spread_rows(len(checked_cameras(cameras)), most_images or len(cameras))
     shape = (len(views), cameras.height, cameras.width)
     images = {
@@ -257,6 +265,9 @@ def _score_images(
     """Score all scenes against the first, view by view; pass every image to ``keep``."""
     if len(checked_cameras(cameras)) == 0:
         raise InvalidArgumentError("an evaluation needs at least one camera, found none.")
+    if not isinstance(settings, EvaluationSettings):
+        raise InvalidArgumentError(f"settings must be EvaluationSettings, found {shown(settings)}.")
+    check_listener(listener)
     if photographs is not None:
         _check_photographs(photographs, cameras)
     metrics = chosen_metrics(settings.lpips, (cameras.width, cameras.height))

@@ -7,6 +7,7 @@ from torch import Tensor
 from cvtgs.devices import without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.losses import SSIM_WINDOW, check_pair, mean_ssim
+from cvtgs.text import shown
 
 
 @torch.no_grad()
@@ -119,10 +120,12 @@ def _alpha_differences(
 ) -> Float[Tensor, "c h w"]:
     """Check two images of alpha and return ``a - b`` in float64."""
     for images in (a, b):
-        if images.ndim != 3 or 0 in images.shape or not images.is_floating_point():
+        is_tensor = isinstance(images, Tensor)
+        if not is_tensor or images.ndim != 3 or 0 in images.shape or not images.is_floating_point():
+            found = f"{images.dtype} of shape {tuple(images.shape)}" if is_tensor else shown(images)
             raise InvalidArgumentError(
-                f"images of alpha must be floats of shape (c, h, w) with nothing empty, "
-                f"found {images.dtype} of shape {tuple(images.shape)}."
+                f"images of alpha must be tensors of floats of shape (c, h, w) with nothing empty, "
+                f"found {found}."
             )
     if a.shape != b.shape or a.dtype != b.dtype or a.device != b.device:
         raise InvalidArgumentError(

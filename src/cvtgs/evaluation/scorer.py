@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Self
+from typing import Literal, NamedTuple, Self, get_args
 
 import torch
 from jaxtyping import Float
@@ -154,7 +154,8 @@ class EvaluationSettings:
         backend: The rendering backend.
 
     Raises:
-        InvalidArgumentError: The background does not consist of three numbers in [0, 1].
+        InvalidArgumentError: The background does not consist of three numbers in [0, 1], or there
+            is no such network or backend.
 
     Example:
         >>> EvaluationSettings(lpips="off").background
@@ -170,6 +171,12 @@ class EvaluationSettings:
             raise InvalidArgumentError(
                 f"background must be three numbers in [0, 1], found {shown(self.background)}."
             )
+        for name, choices in (("lpips", LpipsChoice), ("backend", BackendName)):
+            if getattr(self, name) not in get_args(choices):
+                raise InvalidArgumentError(
+                    f"{name} must be one of {', '.join(get_args(choices))}, "
+                    f"found {shown(getattr(self, name))}."
+                )
 
 
 def _is_color(value: Sequence[float]) -> bool:
@@ -276,8 +283,6 @@ def chosen_metrics(choice: LpipsChoice, size: tuple[int, int]) -> Metrics:
         return Metrics()
     if choice in ("vgg", "alex"):
         return Metrics(lpips=load_lpips(choice), note="")
-    if choice != "auto":
-        raise InvalidArgumentError(f"lpips must be auto, vgg, alex or off, found {choice!r}.")
     note = ""
     networks: tuple[LpipsNetwork, ...] = ("vgg", "alex")
     for network in networks:
