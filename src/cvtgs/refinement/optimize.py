@@ -365,7 +365,8 @@ def _marks(scene: GaussianScene) -> Float[Tensor, "n"]:
     marks = torch.zeros_like(scene.logit_opacities, dtype=torch.float64)
     columns = (column for name in MARKING for column in _flat(scene, name).unbind(1))
     for number, column in enumerate(columns):
-        marks += column.double() * math.sqrt(2 + number)  # incommensurable: sums rarely coincide
+        finite = column.double().clamp(-1e9, 1e9)  # opacity logits may be infinite
+        marks += finite * math.sqrt(2 + number)  # incommensurable: sums rarely coincide
     marks %= 1.0
     runs = runs_of_equal(torch.cat([scene.means.double(), marks[:, None]], dim=1))
     if runs is not None:
