@@ -110,16 +110,16 @@ def written(number: "float | Tensor") -> str:
 
 
 def _is_ratio(value: object) -> bool:
-    return 0.0 < _number(value) <= 1.0
+    return 0.0 < real_number(value) <= 1.0
 
 
 def check_share(value: object, name: str) -> None:
     """Raise unless a value is a number from 0 to 1."""
-    if not 0.0 <= _number(value) <= 1.0:
+    if not 0.0 <= real_number(value) <= 1.0:
         raise InvalidArgumentError(f"{name} must be a number from 0 to 1, found {shown(value)}.")
 
 
-def _number(value: object) -> float:
+def real_number(value: object) -> float:
     """Return a number as a float; NaN for anything else, such as texts and truth values."""
     if isinstance(value, str | bytes | bytearray) or "bool" in type(value).__name__:
         return math.nan
@@ -154,14 +154,6 @@ def check_whole(
 def shortfall(valid: int, total: int, target: int) -> str:
     """Return the reason why fewer Gaussians are kept than asked for; empty if there is none."""
     return f"only {valid} of {total} Gaussians are valid" if valid < target else ""
-
-
-def real_number(number: object) -> float:
-    """Return a number of any type, or NaN if it is none."""
-    try:
-        return math.nan if isinstance(number, str | bytes) else float(number)  # type: ignore[arg-type]
-    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor of several numbers
-        return math.nan
 
 
 def check_frozen(frozen: object, count: int) -> None:
