@@ -198,4 +198,6 @@ def test_the_command_writes_levels(scene, tmp_path, capsys):
     assert main([*words[:-1], "0.1", "--no-scores", "--overwrite"]) == 0
     said = capsys.readouterr().out
     assert "Not in levels.json, of an earlier run: rho_0.01.ply." in said
-    assert main([*words[:-1], "0.1,x"]) == 1
+    with pytest.raises(SystemExit) as ended:
+        main([*words[:-1], "0.1,x"])
+    assert ended.value.code == 2

@@ -301,8 +301,9 @@ def _background(
 ) -> Float[Tensor, "c_or_1 3"] | None:
     if background is None:
         return None
+    device = background.device if isinstance(background, Tensor) else "cpu"
     try:
-        colors = torch.as_tensor(background, dtype=scene.dtype)
+        colors = torch.as_tensor(background, dtype=scene.dtype, device=device)
         found = f"shape {tuple(colors.shape)}"
     except (TypeError, ValueError):
         colors, found = None, shown(background)
