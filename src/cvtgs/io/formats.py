@@ -104,7 +104,7 @@ def load(
         device: The device of the tensors.
         sh_degree: SH bands above this degree are set to zero; None keeps all. For plain PLY files
             their columns are not even copied. The scene keeps the degree of the file, which
-            :meth:`cvtgs.GaussianScene.with_sh_degree` lowers.
+            :meth:`cvtgs.scene.GaussianScene.with_sh_degree` lowers.
         extras: Whether columns beyond the standard ones are kept; only plain PLY files have any.
         axes: The axes of the file, for example ``"rub"``, as :func:`cvtgs.io.change_axes` names
             them; the scene is converted to ``"rdf"``, the axes of PLY files. None uses those that
