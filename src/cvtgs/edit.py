@@ -3,12 +3,12 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from cvtgs.boxes import Box, Corner, inside, listed
+from cvtgs.counts import real_number
 from cvtgs.devices import without_autocast
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn
 from cvtgs.math.parameters import multiply_quats, rotation_matrices
@@ -127,18 +127,10 @@ class Motion:
 def _numbers(values: Iterable[float], count: int) -> tuple[float, ...] | None:
     """Return finite numbers of any type as floats; None if they are others."""
     try:
-        numbers = () if isinstance(values, str | bytes) else tuple(map(_number, values))
+        numbers = () if isinstance(values, str | bytes) else tuple(map(real_number, values))
     except TypeError:  # a single value
         return None
     return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else None
-
-
-def _number(value: Any) -> float:
-    """Return a number of any type as a float; NaN if it is none."""
-    try:
-        return math.nan if isinstance(value, str | bytes) else float(value)
-    except (TypeError, ValueError, OverflowError, RuntimeError):  # a tensor of several numbers
-        return math.nan
 
 
 def _cos_sin(degrees: float) -> tuple[float, float]:
@@ -200,7 +192,7 @@ def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
         True
     """
     check_scene(scene)
-    if not 0 <= _number(least) <= 1:
+    if not 0 <= real_number(least) <= 1:
         raise InvalidArgumentError(
             f"the lowest opacity to keep must be from 0 to 1, found {shown(least)}."
         )
@@ -228,7 +220,7 @@ def drop_large(scene: GaussianScene, largest: float) -> GaussianScene:
         100
     """
     check_scene(scene)
-    if not _number(largest) > 0:
+    if not real_number(largest) > 0:
         raise InvalidArgumentError(
             f"the largest size to keep must be above 0, found {shown(largest)}."
         )
