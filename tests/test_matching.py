@@ -355,7 +355,7 @@ def test_errors_count_what_a_screen_can_show(scene, views):
 
 
 COUNT = "targets must be a tensor of one number for each of 1500 Gaussians, found "
-FROZEN = "frozen must be from 0 to 1500, the number of Gaussians; found "
+FROZEN = "frozen must be a whole number between 0 and the 1,500 Gaussians, found "
 
 
 @pytest.mark.parametrize(

@@ -156,14 +156,6 @@ def shortfall(valid: int, total: int, target: int) -> str:
     return f"only {valid} of {total} Gaussians are valid" if valid < target else ""
 
 
-def check_frozen(frozen: object, count: int) -> None:
-    """Raise unless a value is a number of Gaussians at the start of a scene."""
-    if not 0 <= whole_number(frozen) <= count:
-        raise InvalidArgumentError(
-            f"frozen must be from 0 to {count}, the number of Gaussians; found {shown(frozen)}."
-        )
-
-
 def shared_out(total: int, shares: Sequence[float], *, rooms: Sequence[int]) -> list[int]:
     """Split a count in proportion to shares by largest remainder, with an upper limit for each.
 

@@ -240,5 +240,7 @@ def test_seeds_and_steps_are_whole_numbers_of_any_type():
         ):
             refine(small, full, seed=seed, **options)
     for frozen in (None, 0.5, -1):
-        with pytest.raises(InvalidArgumentError, match=f"frozen must be from 0 .* found {frozen}"):
+        with pytest.raises(
+            InvalidArgumentError, match=f"frozen must be .* between 0 .* found {frozen}"
+        ):
             refine(small, full, frozen=frozen, **options)

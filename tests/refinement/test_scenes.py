@@ -181,7 +181,7 @@ def test_reports_are_joined():
         ({"observed": 5}, InvalidArgumentError, "observed must be ObservedViews, as cvtgs.render"),
         ({"listener": 5}, InvalidArgumentError, "must be a function of a progress event, found 5"),
         ({"steps": 0}, InvalidArgumentError, "a whole number of at least 1, found 0."),
-        ({"steps": 1, "frozen": -1}, InvalidArgumentError, "the number of Gaussians; found -1."),
+        ({"steps": 1, "frozen": -1}, InvalidArgumentError, "Gaussians, found -1."),
         ({"steps": 2.5}, InvalidArgumentError, "a whole number of at least 1, found 2.5."),
         ({"steps": True}, InvalidArgumentError, "a whole number of at least 1, found True."),
         ({"cameras": ring(1)}, InvalidArgumentError, "at least 2 cameras, one of them to be held"),

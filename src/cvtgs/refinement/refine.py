@@ -7,7 +7,7 @@ import torch
 from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock, check_listener
 from cvtgs.config import RefineConfig
-from cvtgs.counts import check_frozen
+from cvtgs.counts import check_whole
 from cvtgs.devices import chosen_device, without_autocast
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer, check_seen
@@ -108,7 +108,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         seconds = config.seconds or None
         steps = config.steps or (DEFAULT_STEPS if seconds is None else None)
     check_limits(seconds, steps=steps)
-    check_frozen(frozen, len(small))
+    check_whole(frozen, "frozen", least=0, most=len(small), things="Gaussians")
     check_listener(listener)
     if observed is not None:
         check_observed(observed, "observed")
