@@ -12,6 +12,7 @@ import torch
 import cvtgs
 from cvtgs.devices import (
     HOST,
+    MOST_THREADS,
     chosen_device,
     chunk_length,
     core_count,
@@ -171,6 +172,28 @@ def test_chunks_are_computed_by_one_thread_each_and_stay_in_order(two_threads):
     with pytest.raises(ZeroDivisionError):
         list(in_threads(lambda number: 1 / number, [1, 0, 2], torch.device("cpu")))
     assert torch.get_num_threads() == 2
+
+
+def test_chunks_share_few_threads_and_the_caller_does_not_compete(two_threads, monkeypatch):
+    monkeypatch.setattr("cvtgs.devices.thread_count", lambda: 16)
+    torch.set_num_threads(16)
+    meanwhile, all_started = [], threading.Barrier(MOST_THREADS)
+
+    def items():
+        for number in range(4 * MOST_THREADS):
+            meanwhile.append(torch.get_num_threads())
+            yield number
+
+    def function(number):
+        if number < MOST_THREADS:
+            all_started.wait(30)
+        return threading.get_ident()
+
+    found = set(in_threads(function, items(), HOST))
+    assert len(found) == MOST_THREADS
+    assert threading.get_ident() not in found
+    assert set(meanwhile) == {1}
+    assert torch.get_num_threads() == 16
 
 
 def test_one_thread_leaves_its_threads_to_kernels(two_threads):

@@ -31,13 +31,20 @@ HOST = torch.device("cpu")
 ALIGNMENT = 128
 """Bytes at which a tensor of a shared copy starts, enough for matrix products."""
 
+MOST_THREADS = 4
+"""Maximum number of threads that share chunks of torch operations.
+
+An operation on a chunk takes some 50 microseconds, and Python's lock is held for a tenth of the
+time. With more threads, most of them wait for the lock.
+"""
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 _SHORT_CHUNKS = ContextVar("short_chunks", default=False)
 
 
 class _Own(threading.local):
-    """Whether the calling thread computes with one thread of torch, and how many it has left."""
+    """Whether the calling thread uses one thread of torch, and how many its kernels may use."""
 
     is_limited = False
     spare = 1
@@ -180,7 +187,9 @@ def thread_count() -> int:
 def in_threads(
     function: Callable[[Item], Result], items: Iterable[Item], device: torch.device
 ) -> Iterator[Result]:
-    """Call a function for chunks in as many threads as torch uses; each call uses one thread.
+    """Call a function for chunks in as many threads as torch uses, at most 4.
+
+    Each call uses one thread.
 
     Chunks are too short for torch to parallelise its operations on them well. Every chunk gives
     the same bits, whatever the number of threads. On other devices than CPUs, chunks run
@@ -209,22 +218,22 @@ def in_chunks(
 def _in_pool(
     function: Callable[[Item], Result], items: Iterable[Item], threads: int
 ) -> Iterator[Result]:
-    has_gradients = torch.is_grad_enabled()
+    has_gradients, workers = torch.is_grad_enabled(), min(threads, MOST_THREADS)
 
     def start(before: int) -> None:
-        _OWN.is_limited = True
+        _OWN.is_limited, _OWN.spare = True, threads // workers
         _limit_own(before)
         torch.set_grad_enabled(has_gradients)
 
     waiting: deque[Future[Result]] = deque()
     with (
-        _restored_threads() as before,
-        ThreadPoolExecutor(threads, initializer=start, initargs=(before,)) as pool,
+        one_thread() as before,  # torch's threads would compete with those of the pool for cores
+        ThreadPoolExecutor(workers, initializer=start, initargs=(before,)) as pool,
     ):
         try:
             for item in items:
                 waiting.append(pool.submit(function, item))
-                if len(waiting) > 2 * threads:  # limits the number of pending results
+                if len(waiting) > 2 * workers:  # limits the number of pending results
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()
@@ -289,20 +298,20 @@ def on_host() -> Iterator[None]:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Make torch use one thread.
+def one_thread() -> Iterator[int]:
+    """Make torch use one thread; yield how many it used before.
 
     Sums then do not depend on the number of cores, and operations that are too small to parallelise
     do not wait for threads.
     """
     if _OWN.is_limited:
-        yield
+        yield _OWN.spare
         return
     with _restored_threads() as before:
         _OWN.is_limited, _OWN.spare = True, before
         _limit_own(before)
         try:
-            yield
+            yield before
         finally:
             _OWN.is_limited, _OWN.spare = False, 1
 
@@ -310,6 +319,7 @@ def one_thread() -> Iterator[None]:
 def kernel_threads() -> int:
     """Return the number of threads for loops whose results do not depend on it.
 
-    It is that of torch, or the one that :func:`one_thread` takes from torch.
+    It is that of torch, or the one that :func:`one_thread` takes from torch; in a thread of
+    :func:`in_threads`, its share of them.
     """
     return max(torch.get_num_threads(), _OWN.spare)

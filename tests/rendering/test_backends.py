@@ -2,7 +2,9 @@
 
 import math
 import sys
+import threading
 import tomllib
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from packaging.requirements import Requirement
 from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError, InvalidArgumentError
 from cvtgs.progress import ProgressEvent
-from cvtgs.rendering import choose_backend, render
+from cvtgs.rendering import choose_backend, contributions, observe, render
 from process_cases import python
 from scenes import random_scene
 
@@ -140,6 +142,49 @@ def test_threads_can_render_at_the_same_time_without_openmp():
         "print(numba.threading_layer(), 'done')\n"
     )
     assert python(program, NUMBA_THREADING_LAYER="workqueue") == ["workqueue done"]
+
+
+@pytest.mark.parametrize("at_a_time", [1, 2])
+def test_images_are_computed_two_at_a_time_where_loops_can_share_the_threads(
+    two_threads, monkeypatch, at_a_time
+):
+    pytest.importorskip("numba")
+    scene, four = random_scene(20), CAMERAS.select(torch.tensor([0, 0, 0, 0]))
+    singly = [render(scene, camera, backend="numba").rgb for camera in four.singles()]
+    amounts = contributions(scene, CAMERAS, backend="numba")
+    backend = import_module("cvtgs.rendering.numba_backend")
+    settings, callers = backend._settings, []
+    meet = threading.Barrier(at_a_time, timeout=30)
+
+    def met(*arguments):
+        meet.wait()  # passes only if so many images are computed at the same time
+        callers.append(threading.get_ident())
+        return settings(*arguments)
+
+    monkeypatch.setattr(backend, "_settings", met)
+    several = "cvtgs.rendering.compiled._takes_several_loops"
+    monkeypatch.setattr(several, lambda: at_a_time > 1)
+    assert torch.equal(render(scene, four, backend="numba").rgb, torch.cat(singly))
+    views = observe(scene, four, backend="numba")
+    assert torch.equal(views.rgb, torch.cat(singly))
+    assert torch.equal(views.contributions, amounts + amounts + amounts + amounts)
+    assert torch.equal(contributions(scene, four, backend="numba"), views.contributions)
+    assert len(callers) == 12
+    assert (threading.get_ident() in callers) == (at_a_time == 1)
+
+
+def test_images_with_gradients_are_computed_one_after_the_other(monkeypatch):
+    pytest.importorskip("numba")
+    monkeypatch.setattr("cvtgs.rendering.numba_backend.for_each_camera", pytest.fail)
+    scene = random_scene(20)
+    means = scene.means.clone().requires_grad_()
+    moved = scene.with_tensors({"means": means})
+    both = CAMERAS.select(torch.tensor([0, 0]))
+    render(moved, both, backend="numba").rgb.sum().backward()
+    twice, means.grad = means.grad, None
+    render(moved, CAMERAS, backend="numba").rgb.sum().backward()
+    assert torch.allclose(twice, 2 * means.grad)
+    assert float(twice.abs().max()) > 0
 
 
 def test_numba_is_installed_with_the_package_where_it_has_wheels():

@@ -17,7 +17,7 @@ from cvtgs.config import AllocationConfig
 from cvtgs.devices import in_chunks
 from cvtgs.math.segments import label_argmin, take_columns
 
-CHUNK = 1 << 14
+CHUNK = 1 << 15
 """Gaussians per chunk of the cost computation, to bound memory."""
 
 SHARE_PER_ROUND = 0.35

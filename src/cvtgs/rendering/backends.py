@@ -1,6 +1,7 @@
 """The interface and output types that all backends share, and the choice of one by name."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Literal, Protocol, cast, get_args
@@ -14,7 +15,6 @@ from cvtgs.errors import DeviceError, InvalidArgumentError, MissingDependencyErr
 from cvtgs.math import segments
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.progress import ProgressEvent, ProgressListener
-from cvtgs.rendering.projection import Pinhole, to_pinholes
 from cvtgs.scene import GaussianScene
 
 BackendName = Literal["auto", "torch", "numba", "gsplat"]
@@ -80,14 +80,14 @@ class Backend(Protocol):
         """Render images on black, on the device of the scene; cameras may be on any."""
         ...
 
-    def contributions(self, scene: GaussianScene, camera: Cameras) -> Tensor:
-        """Return the sum of each Gaussian's weights ``alpha * T`` over one image."""
+    def contributions(self, scene: GaussianScene, cameras: Cameras) -> Iterator[Tensor]:
+        """Yield the sum of each Gaussian's weights ``alpha * T`` over every image."""
         ...
 
     def observe(
-        self, scene: GaussianScene, camera: Cameras, *, sh_degree: int
-    ) -> tuple[RasterOutput, Tensor]:
-        """Render one image on black; return it and the contributions to it."""
+        self, scene: GaussianScene, cameras: Cameras, *, sh_degree: int
+    ) -> Iterator[tuple[RasterOutput, Tensor]]:
+        """Yield every image on black, and the contributions to it."""
         ...
 
     def blending_weights(self, scene: GaussianScene, camera: Cameras) -> BlendingWeights:
@@ -134,52 +134,54 @@ def _backend(name: str, device: torch.device) -> Backend:
     return backend
 
 
-def render_each(
-    render_one: Callable[[Pinhole], Float[Tensor, "h w 5"]],
+def collect_images(
+    images: Generator[Float[Tensor, "h w 5"], None, None],
     scene: GaussianScene,
     cameras: Cameras,
     *,
     listener: ProgressListener,
 ) -> RasterOutput:
-    """Render cameras one by one; an image holds colours, depth and transmittance."""
-    pinholes = to_pinholes(cameras)
-    listener(ProgressEvent(stage=STAGE, done=0, total=len(pinholes)))
+    """Collect the images of all cameras, which hold colours, depth and transmittance."""
+    listener(ProgressEvent(stage=STAGE, done=0, total=len(cameras)))
     found = [scene.means.new_zeros(0, cameras.height, cameras.width, 5)]
-    for number, pinhole in enumerate(pinholes, start=1):
-        found.append(render_one(pinhole)[None])
-        listener(ProgressEvent(stage=STAGE, done=number, total=len(pinholes)))
+    with closing(images):  # an error in `listener` ends their threads
+        for number, image in enumerate(images, start=1):
+            found.append(image[None])
+            listener(ProgressEvent(stage=STAGE, done=number, total=len(cameras)))
     layers = torch.cat(found)
     return RasterOutput(rgb=layers[..., :3], depth=layers[..., 3], alpha=1 - layers[..., 4])
 
 
 def contributions_by_gradient(
-    rasterize: Callable[..., RasterOutput], scene: GaussianScene, camera: Cameras
-) -> Float[Tensor, "n"]:
-    """Compute contributions as the gradient of the summed image with respect to the colours."""
-    with torch.inference_mode(mode=False), torch.enable_grad():
-        # Mid-grey, so that no colour is clipped; the higher SH bands do not matter here.
-        sh0 = torch.zeros_like(scene.sh0).requires_grad_()
-        tensors = scene.tensors() | {"sh0": sh0, "shN": scene.shN[:, :0]}
-        tensors = {
-            name: tensor.clone() if tensor.is_inference() else tensor  # as autograd demands
-            for name, tensor in tensors.items()
-        }
-        gray = scene.with_tensors(tensors, {})
-        image = rasterize(gray, camera, sh_degree=0).rgb
-        (gradient,) = torch.autograd.grad(image[..., 0].sum(), sh0)
-    return gradient[:, 0, 0].double().clamp_min(0.0) / SH_C0
+    rasterize: Callable[..., RasterOutput], scene: GaussianScene, cameras: Cameras
+) -> Iterator[Float[Tensor, "n"]]:
+    """Compute contributions as gradients of summed images with respect to the colours."""
+    for camera in cameras.singles():
+        with torch.inference_mode(mode=False), torch.enable_grad():
+            # Mid-grey, so that no colour is clipped; the higher SH bands do not matter here.
+            sh0 = torch.zeros_like(scene.sh0).requires_grad_()
+            tensors = scene.tensors() | {"sh0": sh0, "shN": scene.shN[:, :0]}
+            tensors = {
+                name: tensor.clone() if tensor.is_inference() else tensor  # as autograd demands
+                for name, tensor in tensors.items()
+            }
+            gray = scene.with_tensors(tensors, {})
+            image = rasterize(gray, camera, sh_degree=0).rgb
+            (gradient,) = torch.autograd.grad(image[..., 0].sum(), sh0)
+        yield gradient[:, 0, 0].double().clamp_min(0.0) / SH_C0
 
 
 def observe_by_gradient(
     rasterize: Callable[..., RasterOutput],
     scene: GaussianScene,
-    camera: Cameras,
+    cameras: Cameras,
     *,
     sh_degree: int,
-) -> tuple[RasterOutput, Float[Tensor, "n"]]:
-    """Render an image, and once more for the contributions to it."""
-    output = rasterize(scene, camera, sh_degree=sh_degree)
-    return output, contributions_by_gradient(rasterize, scene, camera)
+) -> Iterator[tuple[RasterOutput, Float[Tensor, "n"]]]:
+    """Render images, and each once more for the contributions to it."""
+    found = contributions_by_gradient(rasterize, scene, cameras)
+    for camera, sums in zip(cameras.singles(), found, strict=True):
+        yield rasterize(scene, camera, sh_degree=sh_degree), sums
 
 
 class PixelWeights:

@@ -7,7 +7,7 @@ after changing a function that kernels in other files call, clear the cache.
 """
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial, wraps
 from typing import Any, NamedTuple, TypeVar, cast
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cvtgs.devices import kernel_threads
+from cvtgs.devices import HOST, in_threads, kernel_threads
 from cvtgs.errors import MissingDependencyError, how_to_install, is_out_of_memory
 
 try:
@@ -39,6 +39,8 @@ PixelBox = tuple[int, int, int, int]
 """Half-open pixel ranges: first column, end column, first row, end row."""
 
 F = TypeVar("F", bound=Callable[..., object])
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 prange = numba.prange
 """A range whose steps run in parallel in functions compiled by :func:`parallel`."""
@@ -76,6 +78,18 @@ def _takes_several_loops() -> bool:
         return bool(vars(numba)["threading_layer"]() != "workqueue")
     except ValueError:  # chosen in the first loop
         return False
+
+
+def for_each_camera(
+    function: Callable[[Item], Result], cameras: Sequence[Item]
+) -> Generator[Result, None, None]:
+    """Call a function for several cameras at a time, if their loops can share the threads.
+
+    Parts of an image, such as sorting, are computed by one thread. Where numba takes one loop at a
+    time, each loop gets all threads instead.
+    """
+    at_a_time = len(cameras) > 1 and _takes_several_loops()
+    yield from in_threads(function, cameras, HOST) if at_a_time else map(function, cameras)
 
 
 def _compiled(function: F, **settings: bool) -> F:

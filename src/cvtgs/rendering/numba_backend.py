@@ -1,5 +1,6 @@
 """The fast backend on CPUs: projection, tiles and compositing compiled by numba."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,14 @@ from torch.autograd.function import once_differentiable
 from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.rendering.backends import RasterOutput, render_each
-from cvtgs.rendering.compiled import GaussianArrays, RasterSettings, SplatArrays, TileArrays
+from cvtgs.rendering.backends import RasterOutput, collect_images
+from cvtgs.rendering.compiled import (
+    GaussianArrays,
+    RasterSettings,
+    SplatArrays,
+    TileArrays,
+    for_each_camera,
+)
 from cvtgs.rendering.kernels_blending import composite_all, composite_all_gradient
 from cvtgs.rendering.kernels_projection import project_all, project_all_gradient
 from cvtgs.rendering.kernels_tiles import count_tiles, sort_by_tile, write_tiles
@@ -41,47 +48,56 @@ def rasterize(
     sh_degree: int,
     listener: ProgressListener = silent,
 ) -> RasterOutput:
-    """Render with compiled loops, on as many threads as torch uses.
+    """Render with compiled loops, on as many threads as torch uses, up to four images at a time.
 
     For each dtype the first call compiles for about five seconds, and the first backward pass for
     as long again. The code is cached on disk, from where a later process loads it in half a second.
     Results do not depend on the number of threads. Idle OpenMP threads spin for a while after each
     loop; the embedding page of the docs shows how to save that CPU time.
 
-    Memory: ``11 n`` numbers for n Gaussians, ``12 p`` bytes for p intersections of splats and
-    tiles, and the image. The backward pass needs ``10 p`` numbers at a time.
+    Memory per image: ``11 n`` numbers for n Gaussians, ``12 p`` bytes for p intersections of splats
+    and tiles, and the image. The backward pass needs ``10 p`` numbers at a time.
     """
     tensors = [tensor.contiguous() for tensor in scene.tensors().values()]
+    pinholes = to_pinholes(cameras)
 
     def render_one(camera: Pinhole) -> Float[Tensor, "h w 5"]:
         settings = _settings(camera, sh_degree, scene)
         image: Tensor = _Render.apply(settings, *tensors)  # type: ignore[no-untyped-call]
         return image
 
-    return render_each(render_one, scene, cameras, listener=listener)
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+        images = (render_one(pinhole) for pinhole in pinholes)
+    else:
+        images = for_each_camera(render_one, pinholes)
+    return collect_images(images, scene, cameras, listener=listener)
 
 
-def contributions(scene: GaussianScene, camera: Cameras) -> Float[Tensor, "n"]:
-    """Return the sum of each Gaussian's weights ``alpha * T`` over one image, in a forward pass."""
-    return observe(scene, camera, sh_degree=0)[1]
+def contributions(scene: GaussianScene, cameras: Cameras) -> Iterator[Float[Tensor, "n"]]:
+    """Yield the sum of each Gaussian's weights ``alpha * T`` over every image, without gradient."""
+    return (found for _, found in observe(scene, cameras, sh_degree=0))
 
 
 def observe(
-    scene: GaussianScene, camera: Cameras, *, sh_degree: int
-) -> tuple[RasterOutput, Float[Tensor, "n"]]:
-    """Render one image and sum each Gaussian's weights over it in the same pass."""
-    (pinhole,) = to_pinholes(camera)
-    settings = _settings(pinhole, sh_degree, scene)
-    splats, tiles = _splats_by_tile(_arrays(scene), settings)
-    image = np.empty((settings.size[1], settings.size[0], 5), splats.packed.dtype)
-    weights = np.zeros(len(tiles.lists))
-    composite_all(splats.packed, tiles, _pixel_centers(image), image, weights)
-    sums = np.concatenate([[0.0], np.cumsum(weights)])[splats.starts]
-    found = np.zeros(len(scene))
-    found[splats.rows] = np.diff(sums)
-    layers = torch.from_numpy(image)[None]
-    output = RasterOutput(rgb=layers[..., :3], depth=layers[..., 3], alpha=1 - layers[..., 4])
-    return output, torch.from_numpy(found)
+    scene: GaussianScene, cameras: Cameras, *, sh_degree: int
+) -> Iterator[tuple[RasterOutput, Float[Tensor, "n"]]]:
+    """Yield every image, and each Gaussian's weights summed over it in the same pass."""
+    gaussians = _arrays(scene)
+
+    def observe_one(pinhole: Pinhole) -> tuple[RasterOutput, Tensor]:
+        settings = _settings(pinhole, sh_degree, scene)
+        splats, tiles = _splats_by_tile(gaussians, settings)
+        image = np.empty((settings.size[1], settings.size[0], 5), splats.packed.dtype)
+        weights = np.zeros(len(tiles.lists))
+        composite_all(splats.packed, tiles, _pixel_centers(image), image, weights)
+        sums = np.concatenate([[0.0], np.cumsum(weights)])[splats.starts]
+        found = np.zeros(len(scene))
+        found[splats.rows] = np.diff(sums)
+        layers = torch.from_numpy(image)[None]
+        output = RasterOutput(rgb=layers[..., :3], depth=layers[..., 3], alpha=1 - layers[..., 4])
+        return output, torch.from_numpy(found)
+
+    return for_each_camera(observe_one, to_pinholes(cameras))
 
 
 def blending_weights(scene: GaussianScene, camera: Cameras) -> TileWeights:

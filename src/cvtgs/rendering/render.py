@@ -61,7 +61,8 @@ def render(
     the background; cameras are constants. Gaussians with a non-finite position, shape or opacity
     contribute nothing. Autocast of torch has no effect.
 
-    Memory: cameras are rendered one by one; each backend's ``rasterize`` states its formula.
+    Memory: each backend's ``rasterize`` states its formula. Cameras are rendered one by one, by
+    ``numba`` without gradients up to four at a time.
 
     Args:
         scene: The Gaussians, or a file or folder of them. Images get the scene's device and dtype.
@@ -125,7 +126,7 @@ def contributions(
     ``T`` is the transmittance in front of the Gaussian (Kerbl et al. 2023, equation 3). Colours do
     not matter. The contributions of all Gaussians add up to the summed alpha of the images.
 
-    Memory: that of rendering one image, with its gradient for backends other than ``numba``.
+    Memory: that of rendering up to four images with ``numba``, else of one with its gradient.
 
     Args:
         scene: The Gaussians.
@@ -150,8 +151,8 @@ def contributions(
     """
     chosen = choose_backend(backend, scene.device)[1]
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
-    for camera in checked_cameras(cameras).singles():
-        total += chosen.contributions(scene, camera)
+    for found in chosen.contributions(scene, checked_cameras(cameras)):
+        total += found
     return total
 
 
@@ -236,8 +237,7 @@ def observe(
     name, chosen = choose_backend(backend, scene.device)
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
     outputs = []
-    for camera in cameras.singles():
-        output, found = chosen.observe(scene, camera, sh_degree=scene.sh_degree)
+    for output, found in chosen.observe(scene, cameras, sh_degree=scene.sh_degree):
         total += found
         outputs.append(output)
     return ObservedViews(

@@ -85,8 +85,8 @@ def rasterize(
     With gradients each camera also keeps the tensors of its projection, ``30 p`` bytes and the
     image; its backward pass needs ``10 p`` numbers at a time.
     """
-    render_one = partial(_render_one, scene, sh_degree)
-    return backends.render_each(render_one, scene, cameras, listener=listener)
+    images = (_render_one(scene, sh_degree, camera) for camera in to_pinholes(cameras))
+    return backends.collect_images(images, scene, cameras, listener=listener)
 
 
 contributions = partial(backends.contributions_by_gradient, rasterize)
