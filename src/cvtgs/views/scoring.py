@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras, look_at
+from cvtgs.devices import in_threads
 from cvtgs.math import parameters
 from cvtgs.rendering import observe, render
 from cvtgs.scene import GaussianScene
@@ -117,18 +118,24 @@ def measure_splats(
 ) -> SplatSizes:
     """Return the sizes of the splats that cameras show; ``widths`` need not be as drawn."""
     means = scene.means.double()
-    in_image, in_scene, finest = [], [], []
-    for camera in cameras.singles():
+
+    def measure(camera: Cameras) -> Float[Tensor, "3"]:
         painted = observe(scene, camera).contributions.double()
         ahead = means @ camera.viewmats[0, 2, :3] + camera.viewmats[0, 2, 3]
         seen = painted > 0
         seen |= ~seen.any()  # an empty image shows no size
         near = widths[seen] / ahead[seen].clamp_min(1e-9)
         share_of_image = camera.Ks[0, 0, 0] / max(camera.width, camera.height)
-        in_image.append(_weighted_quantile(near, painted[seen], 0.5) * share_of_image)
-        in_scene.append(_weighted_quantile(widths[seen], painted[seen], 0.5) / radius)
-        finest.append(_weighted_quantile(widths[seen], painted[seen], 0.1) / radius)
-    return SplatSizes(torch.stack(in_image), torch.stack(in_scene), torch.stack(finest))
+        return torch.stack(
+            [
+                _weighted_quantile(near, painted[seen], 0.5) * share_of_image,
+                _weighted_quantile(widths[seen], painted[seen], 0.5) / radius,
+                _weighted_quantile(widths[seen], painted[seen], 0.1) / radius,
+            ]
+        )
+
+    sizes = torch.stack(list(in_threads(measure, cameras.singles(), scene.device)))
+    return SplatSizes(*sizes.unbind(1))
 
 
 def _weighted_quantile(
