@@ -174,9 +174,12 @@ def test_chunks_are_computed_by_one_thread_each_and_stay_in_order(two_threads):
     assert torch.get_num_threads() == 2
 
 
-def test_chunks_share_few_threads_and_the_caller_does_not_compete(two_threads, monkeypatch):
-    monkeypatch.setattr("cvtgs.devices.thread_count", lambda: 16)
-    torch.set_num_threads(16)
+@pytest.mark.parametrize(("cores", "share"), [(16, 4), (6, 2)])
+def test_chunks_share_few_threads_and_the_caller_does_not_compete(
+    two_threads, monkeypatch, cores, share
+):
+    monkeypatch.setattr("cvtgs.devices.thread_count", lambda: cores)
+    torch.set_num_threads(cores)
     meanwhile, all_started = [], threading.Barrier(MOST_THREADS)
 
     def items():
@@ -187,13 +190,14 @@ def test_chunks_share_few_threads_and_the_caller_does_not_compete(two_threads, m
     def function(number):
         if number < MOST_THREADS:
             all_started.wait(30)
-        return threading.get_ident()
+        return threading.get_ident(), kernel_threads()
 
-    found = set(in_threads(function, items(), HOST))
-    assert len(found) == MOST_THREADS
-    assert threading.get_ident() not in found
+    callers, shares = map(set, zip(*in_threads(function, items(), HOST), strict=True))
+    assert len(callers) == MOST_THREADS
+    assert threading.get_ident() not in callers
+    assert shares == {share}
     assert set(meanwhile) == {1}
-    assert torch.get_num_threads() == 16
+    assert torch.get_num_threads() == cores
 
 
 def test_one_thread_leaves_its_threads_to_kernels(two_threads):

@@ -187,13 +187,12 @@ def thread_count() -> int:
 def in_threads(
     function: Callable[[Item], Result], items: Iterable[Item], device: torch.device
 ) -> Iterator[Result]:
-    """Call a function for chunks in as many threads as torch uses, at most 4.
+    """Call a function for chunks in as many threads as torch uses, at most ``MOST_THREADS``.
 
-    Each call uses one thread.
-
-    Chunks are too short for torch to parallelise its operations on them well. Every chunk gives
-    the same bits, whatever the number of threads. On other devices than CPUs, chunks run
-    sequentially. Results come in the order of the items, computed when requested or earlier.
+    Chunks are too short for torch to parallelise its operations on them well, so each call uses one
+    thread of torch. Every chunk gives the same bits, whatever the number of threads. On other
+    devices than CPUs, chunks run sequentially. Results come in the order of the items, computed
+    when requested or earlier.
     """
     with _Limits.lock:
         threads = torch.get_num_threads()
@@ -221,7 +220,7 @@ def _in_pool(
     has_gradients, workers = torch.is_grad_enabled(), min(threads, MOST_THREADS)
 
     def start(before: int) -> None:
-        _OWN.is_limited, _OWN.spare = True, threads // workers
+        _OWN.is_limited, _OWN.spare = True, -(-threads // workers)
         _limit_own(before)
         torch.set_grad_enabled(has_gradients)
 
