@@ -23,8 +23,9 @@ from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.analysis import BAND_LOSS, band_losses, duplicate_share, far_share, haze_share
 from cvtgs.clock import peak_memory_bytes
 from cvtgs.math.frames import robust_frame
-from cvtgs.scene import ANTIALIASED_TAG, FLAT_LOG_SCALE
+from cvtgs.scene import FLAT_LOG_SCALE
 from cvtgs.synthetic import scene as make
+from cvtgs.tags import ANTIALIASED
 from cvtgs.views import automatic_views
 
 LOOK = {"visibility": {"views": 8}}
@@ -50,7 +51,7 @@ def without_bands(count: int) -> GaussianScene:
 
 
 def tagged(count: int) -> GaussianScene:
-    return replace(make("thin", count, sh_degree=0), comments=(ANTIALIASED_TAG,))
+    return replace(make("thin", count, sh_degree=0), comments=(ANTIALIASED.text,))
 
 
 def without_faint(count: int) -> GaussianScene:

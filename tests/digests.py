@@ -22,7 +22,7 @@ from cvtgs import synthetic
 from cvtgs.boxes import Box
 from cvtgs.config import SimplifyConfig
 from cvtgs.outofcore import simplify_file
-from cvtgs.scene import ANTIALIASED_TAG
+from cvtgs.tags import ANTIALIASED
 
 FILE = Path(__file__).with_name("digests.json")
 KINDS = {"object": 3, "room": 1, "landscape": 2, "haze": 3, "thin": 0, "courtyard": 2}
@@ -86,7 +86,7 @@ def damaged() -> Iterator:
 
 
 def tagged() -> Iterator:
-    scene = replace(make("object"), comments=(ANTIALIASED_TAG,))
+    scene = replace(make("object"), comments=(ANTIALIASED.text,))
     yield cvtgs.Simplifier(device="cpu").simplify(scene, 0.1)
 
 

@@ -12,7 +12,7 @@ import torch
 import oracles
 from cvtgs import CvtgsError, GaussianScene, load, load_cameras
 from cvtgs.errors import FileFormatError
-from cvtgs.scene import ANTIALIASED_TAG
+from cvtgs.tags import ANTIALIASED
 from format_oracles import Splat
 from scenes import moved, random_scene
 
@@ -23,7 +23,7 @@ def storable_scene(count: int, *, seed: int = 0, degree: int = 3) -> GaussianSce
     """Return a scene whose values no format clamps."""
     scene = random_scene(count, seed=seed, degree=degree)
     tensors = {"sh0": scene.sh0.clamp(-1.7, 1.7), "shN": scene.shN.clamp(-0.9, 0.9)}
-    return replace(scene.with_tensors(tensors, {}), comments=(ANTIALIASED_TAG,))
+    return replace(scene.with_tensors(tensors, {}), comments=(ANTIALIASED.text,))
 
 
 def with_extension(content: bytes, kind: int, payload: bytes) -> bytes:

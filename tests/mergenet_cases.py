@@ -15,7 +15,7 @@ from cvtgs.config import MergeConfig
 from cvtgs.cvt import nearest_neighbors
 from cvtgs.math.frames import robust_frame
 from cvtgs.mergenet import Architecture, MergeNet, Residuals, compose, correct_cells
-from cvtgs.scene import ANTIALIASED_TAG
+from cvtgs.tags import ANTIALIASED
 from scenes import random_scene
 
 
@@ -134,7 +134,7 @@ def some_case(
 ) -> Case:
     scene = random_scene(count, degree=degree, dtype=dtype, seed=seed, size=0.4)
     if tagged:
-        scene = replace(scene, comments=(ANTIALIASED_TAG,))
+        scene = replace(scene, comments=(ANTIALIASED.text,))
     return case_of(scene, some_labels(count, cells), near=near)
 
 

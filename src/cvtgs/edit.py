@@ -14,6 +14,7 @@ from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn
 from cvtgs.math.parameters import multiply_quats, rotation_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS, rotated_rest
 from cvtgs.scene import NORMALS, GaussianScene, check_scene, checked_scenes, concatenate
+from cvtgs.tags import TWO_SCALES
 from cvtgs.text import shown
 
 __all__ = ["Motion", "Sphere", "crop", "drop_faint", "drop_large", "merge", "move"]
@@ -340,6 +341,8 @@ def merge(scenes: Iterable[GaussianScene]) -> GaussianScene:
     same_layout = len({scene.layout for scene in scenes}) == 1
     alike = [_widened(scene, degree, dtype, common) for scene in scenes]
     comments = tuple(dict.fromkeys(line for scene in scenes for line in scene.comments))
+    if not all(scene.has_two_scales for scene in scenes):
+        comments = TWO_SCALES.removed_from(comments)
     merged = concatenate(alike)
     return replace(merged, comments=comments, layout=scenes[0].layout if same_layout else ())
 

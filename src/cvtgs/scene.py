@@ -1,7 +1,6 @@
 """GaussianScene: the Gaussians of a scene in stored (not activated) parameters."""
 
 import os
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,12 +17,9 @@ from cvtgs.devices import row_chunks, usable_device
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.selection import row_numbers
+from cvtgs.tags import ANTIALIASED, TWO_SCALES
 from cvtgs.text import counted, shown
 
-ANTIALIASED_TAG = "SplatRenderMode: mip"
-"""The comment of scenes that were trained with anti-aliasing (Mip-Splatting)."""
-ANTIALIASED_PATTERN = re.compile(rf"(?im){ANTIALIASED_TAG}|^\s*antialiased\s+1\s*$")
-"""Matches this comment, which Brush also writes, and that of Postshot."""
 FLAT_LOG_SCALE = -20.0
 """Third log-scale of Gaussians with two scales (2DGS): two billionths of a scene unit."""
 NORMALS = ("nx", "ny", "nz")
@@ -163,12 +159,13 @@ class GaussianScene:
     @property
     def antialiased(self) -> bool:
         """Whether the scene was trained with anti-aliasing and must be rendered with it."""
-        return any(map(ANTIALIASED_PATTERN.search, self.comments))
+        return ANTIALIASED.is_in(self.comments)
 
     @property
     def has_two_scales(self) -> bool:
-        """Whether the file had two scales per Gaussian: surfels of 2DGS (Huang et al. 2024)."""
-        return bool(self.layout) and "scale_2" not in dict(self.layout)
+        """Whether the file had surfels of 2DGS (Huang et al. 2024): two scales, or their tag."""
+        has_third = not self.layout or "scale_2" in dict(self.layout)
+        return not has_third or TWO_SCALES.is_in(self.comments)
 
     @property
     def device(self) -> torch.device:

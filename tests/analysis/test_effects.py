@@ -20,7 +20,7 @@ from cvtgs.analysis import (
 )
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.spherical_harmonics import REST_COUNTS, evaluate
-from cvtgs.scene import ANTIALIASED_TAG
+from cvtgs.tags import ANTIALIASED
 from scenes import random_scene
 
 FRAME = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=2.0)
@@ -196,7 +196,7 @@ def test_without_far_gaussians_unbounded_cannot_be_forced_on():
 @pytest.mark.parametrize("tagged", [True, False])
 @pytest.mark.parametrize("choice", ["auto", "on", "off"])
 def test_antialiasing_depends_on_the_tag(tagged, choice):
-    comments = (ANTIALIASED_TAG,) if tagged else ("nothing",)
+    comments = (ANTIALIASED.text,) if tagged else ("nothing",)
     scene = GaussianScene(**random_scene(50).tensors(), comments=comments)
     effect = plan_of(scene, mip=choice).mip
     assert effect.active is (tagged and choice != "off")

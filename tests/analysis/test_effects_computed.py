@@ -13,7 +13,7 @@ from cvtgs.cells import features
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.mergenet import MergeNet
-from cvtgs.scene import ANTIALIASED_TAG
+from cvtgs.tags import ANTIALIASED
 from refine_cases import ring
 from scenes import random_scene, same_bits
 
@@ -40,7 +40,7 @@ def with_zero_bands(scene: GaussianScene, above: int) -> GaussianScene:
 
 
 def tagged(scene: GaussianScene) -> GaussianScene:
-    return GaussianScene(**scene.tensors(), comments=("made up", ANTIALIASED_TAG))
+    return GaussianScene(**scene.tensors(), comments=("made up", ANTIALIASED.text))
 
 
 @pytest.mark.parametrize("preset", PRESETS)

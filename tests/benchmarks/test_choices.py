@@ -12,7 +12,7 @@ from benchmarks import cameras as camera_files
 from benchmarks import choices, heights
 from cvtgs.edit import Motion, move
 from cvtgs.evaluation import EvaluationSettings
-from cvtgs.scene import ANTIALIASED_TAG
+from cvtgs.tags import ANTIALIASED
 from cvtgs.views import automatic_views
 
 SCENE = cvtgs.synthetic.scene("object", 600, sh_degree=0, seed=0)
@@ -65,13 +65,13 @@ def test_a_checkpoint_is_a_choice(file, tmp_path):
 
 def test_images_may_ignore_the_tag(tmp_path, file):
     """The images of the full scene, too, also if those with the tag are cached."""
-    tagged = replace(SCENE, comments=(ANTIALIASED_TAG,))
+    tagged = replace(SCENE, comments=(ANTIALIASED.text,))
     cvtgs.save(tagged, file, overwrite=True)
     place = tmp_path / "rows.json"
     common = ["--rho", "0.1", "--cache", str(tmp_path / "kept"), "--json", str(place)]
     small = cvtgs.Simplifier().simplify(tagged, 0.1)
     settings = EvaluationSettings(lpips="off")
-    for more, comments in ([], (ANTIALIASED_TAG,)), (["--ignore-tag"], ()):
+    for more, comments in ([], (ANTIALIASED.text,)), (["--ignore-tag"], ()):
         choices.main([str(file), *common, *more])
         full, shown = (replace(scene, comments=comments) for scene in (SCENE, small))
         scores = cvtgs.evaluate(full, {"small": shown}, VIEWS, settings=settings).scenes[0]

@@ -17,7 +17,7 @@ from cvtgs.cells import (
 )
 from cvtgs.config import MergeConfig
 from cvtgs.math import depths, parameters
-from cvtgs.scene import ANTIALIASED_TAG
+from cvtgs.tags import ANTIALIASED
 from scenes import assert_same_gaussians, covariances_of, moved, oracle_rows, random_scene
 
 RULES = {
@@ -134,7 +134,7 @@ def test_saturating_averages_two_depths_for_antialiased_scenes():
     """The square root of both depths' product, which is computed here member by member."""
     scene, cells = random_scene(400, dtype=torch.float64), random_cells(400, 150)
     plain = merged(scene, cells, RULES["standard"])
-    tagged = merged(replace(scene, comments=(ANTIALIASED_TAG,)), cells, RULES["standard"])
+    tagged = merged(replace(scene, comments=(ANTIALIASED.text,)), cells, RULES["standard"])
     opaque = -math.log(0.01)
     member_depths = -torch.log1p(-scene.opacities)
     images = (member_depths.clamp_max(opaque) * scene.areas)[cells.order]

@@ -66,6 +66,14 @@ def test_files_are_read_as_by_the_oracle(tmp_path: Path, ranges: list[str], rest
     assert_as_oracle(load(path), read_compressed_ply(path.read_bytes()))
 
 
+def test_an_empty_table_of_bands_is_read(tmp_path: Path) -> None:
+    """The exporter of gsplat 1.5 declares a table without columns at SH degree 0."""
+    path = tmp_path / "a.ply"
+    content = by_hand()
+    path.write_bytes(content.replace(b"end_header", b"element sh 1\nend_header"))
+    assert_as_oracle(load(path), read_compressed_ply(content))
+
+
 def test_a_file_of_splat_transform_is_read() -> None:
     scene, source = load(THEIRS), load(DATA / "source.ply")
     assert_as_oracle(scene, read_compressed_ply(THEIRS.read_bytes()))

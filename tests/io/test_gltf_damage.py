@@ -164,7 +164,8 @@ def test_negative_scales_are_refused(small: Path) -> None:
     value = struct.pack("<f", -0.5)
     small.write_bytes(joined(document, binary[: start + 12] + value + binary[start + 16 :]))
     assert refusal(small) == (
-        f"{small}: {NAME}:SCALE must not be negative, found -0.5 in element 1."
+        f"{small}: {NAME}:SCALE must not be negative, found -0.5 in element 1 (a draft of the "
+        f"extension, which splat-transform 2.3 wrote, stored logarithms)."
     )
 
 

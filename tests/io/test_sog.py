@@ -235,6 +235,15 @@ def test_equal_rows_have_one_palette_entry() -> None:
     assert len(palette(np.ones((100, 3)), 16).entries) == 1
 
 
+def test_a_missing_first_code_is_extrapolated(tmp_path: Path) -> None:
+    codes = [0.0, *range(1, 256)]
+    found = load(changed(tmp_path, lambda m: m["scales"].update(codebook=[None, *codes[1:]])))
+    whole = load(changed(tmp_path, lambda m: m["scales"].update(codebook=codes)))
+    expected = torch.where(whole.log_scales == 0, 1 - 254 / 255, whole.log_scales)
+    assert torch.equal(found.log_scales, expected)
+    assert not torch.equal(found.log_scales, whole.log_scales)
+
+
 DAMAGED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "version": (lambda m: m.update(version=3), "'version' must be 1 or 2, found 3."),
     "count": (lambda m: m.update(count=0), "a SOG must hold 1 to 268,402,689 Gaussians, found 0."),
@@ -252,6 +261,8 @@ DAMAGED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
         lambda m: m["scales"].update(codebook=[]),
         "'codebook' must be 1 to 256 finite numbers, found [].",
     ),
+    "no code": (lambda m: m["sh0"].update(codebook=[1.0, None]), "'codebook' must be 1 to 256"),
+    "short": (lambda m: m["sh0"].update(codebook=[None, 1.0]), "'codebook' must be 1 to 256"),
     "bands": (lambda m: m["shN"].update(bands=4), "'bands' must be 1, 2 or 3, found 4."),
     "other bands": (
         lambda m: m["shN"].update(bands=2),

@@ -20,7 +20,8 @@ from cvtgs.outofcore.halo import Balls, OtherBlock, assign_points, bounding_box,
 from cvtgs.outofcore.merge import read_cells
 from cvtgs.outofcore.rows import read_rows
 from cvtgs.pipeline import shape_merged
-from cvtgs.scene import ANTIALIASED_TAG, concatenate
+from cvtgs.scene import concatenate
+from cvtgs.tags import ANTIALIASED
 from cvtgs.views import automatic_views
 from scenes import same_bits
 
@@ -34,7 +35,7 @@ def job(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def tagged_job(tmp_path_factory):
-    return courtyard_job(tmp_path_factory.mktemp("tagged"), comments=(ANTIALIASED_TAG,))
+    return courtyard_job(tmp_path_factory.mktemp("tagged"), comments=(ANTIALIASED.text,))
 
 
 def courtyard_job(folder, *, comments=()):

@@ -10,7 +10,7 @@ from camera_files import pose, transforms, write_json
 from cvtgs import GaussianScene
 from cvtgs.config import SimplifyConfig
 from cvtgs.errors import OutputError
-from cvtgs.scene import ANTIALIASED_TAG
+from cvtgs.tags import ANTIALIASED
 from cvtgs.train import Source, TrainConfig, ViewsConfig
 from cvtgs.train.cache import prepare_scene
 from cvtgs.train.cases import make_case, render_views
@@ -223,7 +223,7 @@ def test_a_damaged_file_is_recomputed(source, made, tmp_path, damage):
 @pytest.mark.slow
 def test_an_antialiased_scene_stays_antialiased(tmp_path):
     """Its merged Gaussians are rendered antialiased, too."""
-    scene = replace(small_scene(300), comments=(ANTIALIASED_TAG,))
+    scene = replace(small_scene(300), comments=(ANTIALIASED.text,))
     for _ in range(2):
         case = prepare_scene(source_of(scene), config_of(), tmp_path).cases[1]
         assert case.reference.merged.antialiased

@@ -13,7 +13,7 @@ from cvtgs.evaluation import psnr
 from cvtgs.evaluation.scorer import MOST_PSNR
 from cvtgs.losses import image_loss
 from cvtgs.rendering import Rendering, render
-from cvtgs.scene import ANTIALIASED_TAG
+from cvtgs.tags import ANTIALIASED
 from cvtgs.train import LossConfig
 from cvtgs.train.cases import TargetViews, render_views
 from cvtgs.train.losses import local_loss, scene_loss, validation_psnr, view_loss
@@ -141,7 +141,7 @@ def test_half_of_the_images_of_a_tagged_scene_ignore_the_tag(tagged, share, monk
 
     monkeypatch.setattr("cvtgs.train.losses.render", watched)
     case, views = some_case(), render_views(small_scene(), 4, size=32, seed=0)
-    merged = replace(case.reference.merged, comments=(ANTIALIASED_TAG,) if tagged else ())
+    merged = replace(case.reference.merged, comments=(ANTIALIASED.text,) if tagged else ())
     case = replace(case, reference=case.reference._replace(merged=merged))
     assert sum(views.cameras.ignores_tag) == 1
     for seed in range(50):

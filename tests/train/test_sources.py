@@ -8,7 +8,7 @@ import torch
 
 import cvtgs
 from cvtgs.errors import ConfigError, FileFormatError
-from cvtgs.scene import ANTIALIASED_TAG
+from cvtgs.tags import ANTIALIASED
 from cvtgs.train import DataConfig, find_sources
 from cvtgs.train.sources import VALIDATION_SEED, cut_block, perturb
 from cvtgs.validity import invalid_rows
@@ -220,7 +220,7 @@ def test_a_perturbed_scene_is_never_empty():
     assert {len(perturb(one, random.Random(seed))) for seed in range(20)} == {1}
 
 
-@pytest.mark.parametrize("comments", [(), (ANTIALIASED_TAG,)])
+@pytest.mark.parametrize("comments", [(), (ANTIALIASED.text,)])
 def test_half_of_the_perturbed_scenes_are_tagged(comments):
     scene = replace(small_scene(20), comments=comments)
     tagged = sum(perturb(scene, random.Random(seed)).antialiased for seed in range(40))

@@ -15,7 +15,8 @@ from cvtgs.losses import SSIM_WINDOW
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import divide
 from cvtgs.rendering import ObservedViews, contributions, observe
-from cvtgs.scene import ANTIALIASED_PATTERN, FLAT_LOG_SCALE, GaussianScene
+from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
+from cvtgs.tags import ANTIALIASED, TWO_SCALES
 from cvtgs.views import mixed_views
 
 MIN_OPACITY = 1e-6
@@ -310,9 +311,7 @@ def drop_mip_tag(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
     """
     if plan.mip.active or not scene.antialiased:
         return scene
-    return replace(
-        scene, comments=tuple(c for c in scene.comments if not ANTIALIASED_PATTERN.search(c))
-    )
+    return replace(scene, comments=ANTIALIASED.removed_from(scene.comments))
 
 
 def restore_columns(small: GaussianScene, scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
@@ -324,8 +323,9 @@ def restore_columns(small: GaussianScene, scene: GaussianScene, plan: EffectPlan
         plan: The effect plan of the input scene.
 
     Returns:
-        The small scene with the SH degree and the comments of ``scene``: dropped bands are zeros,
-        and third scales are negligible if the Gaussians of ``scene`` have two scales.
+        The small scene with the SH degree and the comments of ``scene``: dropped bands are zeros.
+        If the Gaussians of ``scene`` have two scales, third ones are negligible, unless the plan
+        makes them thick; then the tag 2dgs is left out.
 
     Example:
         >>> from cvtgs.analysis import plan_effects
@@ -335,7 +335,7 @@ def restore_columns(small: GaussianScene, scene: GaussianScene, plan: EffectPlan
         >>> restore_columns(select_columns(scene, EffectsConfig(sh=0)), scene, plan).sh_degree
         3
     """
-    changes = {}
+    changes, comments = {}, scene.comments
     missing = scene.shN.shape[1] - small.shN.shape[1]
     if missing > 0:
         changes["shN"] = torch.nn.functional.pad(small.shN, (0, 0, 0, missing))
@@ -343,6 +343,8 @@ def restore_columns(small: GaussianScene, scene: GaussianScene, plan: EffectPlan
         flat = small.log_scales.clone()
         flat[:, 2].clamp_(max=FLAT_LOG_SCALE)
         changes["log_scales"] = flat
+    else:
+        comments = TWO_SCALES.removed_from(comments)
     if changes:
         small = small.with_tensors(changes)
-    return small if small.comments == scene.comments else replace(small, comments=scene.comments)
+    return small if small.comments == comments else replace(small, comments=comments)

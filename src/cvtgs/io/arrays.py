@@ -13,7 +13,8 @@ from cvtgs.io.limits import SCALE_RANGE
 from cvtgs.math import parameters
 from cvtgs.math.frames import morton_order
 from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
-from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
+from cvtgs.scene import GaussianScene
+from cvtgs.tags import ANTIALIASED
 from cvtgs.validity import writable_rows
 
 Floats = NDArray[np.float32]
@@ -73,7 +74,7 @@ def scene_of(arrays: Arrays, *, antialiased: bool = False) -> GaussianScene:
         logit_opacities=tensor(arrays.logit_opacities),
         sh0=tensor(arrays.sh0)[:, None, :],
         shN=tensor(arrays.shN),
-        comments=(ANTIALIASED_TAG,) if antialiased else (),
+        comments=(ANTIALIASED.text,) if antialiased else (),
     )
 
 

@@ -160,7 +160,7 @@ def _check(header: Header, path: Path) -> None:
             f"{path}: must hold at least one vertex and a chunk for every {_CHUNK_ROWS} of them, "
             f"found {vertices:,} vertices and {chunks:,} chunks."
         )
-    if "sh" in found:
+    if "sh" in found and found["sh"].properties:  # gsplat writes an empty one at SH degree 0
         _check_rest(found["sh"], vertices, path)
 
 

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, BinaryIO, Literal
@@ -26,6 +27,7 @@ from cvtgs.io.limits import FORMAT_LIMITS, Losses, losses_within
 from cvtgs.io.streams import ByteSink, ByteSource, file_of, name_of, written_to
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene, check_scene
+from cvtgs.tags import TWO_SCALES
 from cvtgs.text import shown
 
 _READERS: Mapping[str, str] = {
@@ -253,6 +255,8 @@ def save(
         check_output(path, overwrite)
     axes = axes or _FILE_AXES.get(suffix, SCENE_AXES)
     scene = change_axes(scene, SCENE_AXES, axes)
+    if suffix != ".ply" and scene.has_two_scales and not TWO_SCALES.is_in(scene.comments):
+        scene = replace(scene, comments=(*scene.comments, TWO_SCALES.text))  # not by a layout
     dropped = losses(scene, named).dropped
     if dropped:
         warn(f"{name}: files of this format do not hold {'; '.join(dropped)}.", DroppedDataWarning)

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from cvtgs.math.spherical_harmonics import REST_COUNTS
-from cvtgs.scene import ANTIALIASED_PATTERN, ANTIALIASED_TAG, GaussianScene
+from cvtgs.scene import GaussianScene
+from cvtgs.tags import ANTIALIASED, TWO_SCALES
 from cvtgs.text import counted
 from cvtgs.validity import writable_rows
 
@@ -39,6 +40,8 @@ class FormatLimits:
     antialiased: bool
     """Whether files record that a scene was trained with anti-aliasing."""
     comments: bool = False
+    two_scales: bool = False
+    """Whether files record that Gaussians are flat; files with comments do so by a tag."""
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Minimum and maximum of the values of a tensor, by its name."""
     largest_coordinate: Callable[[GaussianScene], float] | None = None
@@ -115,6 +118,7 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = {
     ".sog": FormatLimits(
         sh_degree=3,
         antialiased=True,
+        two_scales=True,
         changed=(
             "rows in Morton order",
             "positions in 65,536 steps of sign(x) log(1 + |x|) between minimum and maximum",
@@ -141,7 +145,7 @@ def losses_within(scene: GaussianScene, limits: FormatLimits) -> Losses:
     changed = list(limits.changed)
     if scene.sh_degree > 0 and limits.changed_bands:
         changed.append(limits.changed_bands)
-    others = [line for line in scene.comments if not ANTIALIASED_PATTERN.search(line)]
+    others = ANTIALIASED.removed_from(TWO_SCALES.removed_from(scene.comments))
     if others and not limits.comments:
         changed.append(f"without {counted(len(others), 'comment')}")
     return Losses(
@@ -170,7 +174,10 @@ def dropped_within(scene: GaussianScene, limits: FormatLimits) -> dict[str, int]
         own = f"the scene has degree {scene.sh_degree}"
         dropped[f"SH bands above degree {limits.sh_degree} ({own})"] = 0
     if scene.antialiased and not limits.antialiased:
-        tag = f"the tag '{ANTIALIASED_TAG}', without which viewers show the scene too sharp"
+        tag = f"the tag '{ANTIALIASED.text}', without which viewers show the scene too sharp"
+        dropped[tag] = 0
+    if scene.has_two_scales and not (limits.two_scales or limits.comments):
+        tag = f"the tag '{TWO_SCALES.text}', without which merged Gaussians of the file are thick"
         dropped[tag] = 0
     if scene.dtype == torch.float64:
         dropped["double precision"] = 0

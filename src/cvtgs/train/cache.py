@@ -15,7 +15,8 @@ from cvtgs.cameras import Cameras
 from cvtgs.cells import Descriptors, Partition
 from cvtgs.config import SimplifyConfig
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
-from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
+from cvtgs.scene import GaussianScene
+from cvtgs.tags import ANTIALIASED
 from cvtgs.train.cases import Case, MergedScene, TargetViews, make_case, render_views
 from cvtgs.train.config import TrainConfig
 from cvtgs.train.sources import Source
@@ -149,7 +150,7 @@ def _unpacked_cases(name: str, tensors: Mapping[str, Tensor]) -> tuple[Case, ...
     if not entries:
         return ()
     # Merged Gaussians must be rendered in the same way as their scene.
-    comments = (ANTIALIASED_TAG,) if "antialiased" in tensors else ()
+    comments = (ANTIALIASED.text,) if "antialiased" in tensors else ()
     scene = GaussianScene(**under_prefix("scene/", tensors), comments=comments)
     found = []
     for entry in entries:

@@ -15,7 +15,8 @@ from cvtgs.io import load
 from cvtgs.io.files import is_folder
 from cvtgs.math import parameters
 from cvtgs.mergenet import LearnedScene
-from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
+from cvtgs.scene import GaussianScene
+from cvtgs.tags import ANTIALIASED
 from cvtgs.train.config import DataConfig
 from cvtgs.validity import valid_part
 
@@ -207,4 +208,4 @@ def perturb(scene: GaussianScene, rng: random.Random) -> GaussianScene:
         },
         {},
     )
-    return replace(changed, comments=(ANTIALIASED_TAG,) if rng.random() < TAGGED else ())
+    return replace(changed, comments=(ANTIALIASED.text,) if rng.random() < TAGGED else ())

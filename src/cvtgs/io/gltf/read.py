@@ -45,7 +45,8 @@ from cvtgs.io.gltf.document import (
 from cvtgs.io.spz import decode_spz
 from cvtgs.math.parameters import matrices_to_quats
 from cvtgs.math.spherical_harmonics import REST_COUNTS
-from cvtgs.scene import ANTIALIASED_PATTERN, GaussianScene
+from cvtgs.scene import GaussianScene
+from cvtgs.tags import ANTIALIASED
 from cvtgs.text import printable, shown
 
 _KNOWN = (SPLATS, SPZ, QUANTIZATION)
@@ -233,7 +234,8 @@ def _read_attributes(file: GltfFile, one: _Placed) -> GaussianScene:
     if bool((scales < 0).any()):
         row = int((scales < 0).any(axis=1).argmax())
         raise file.error(
-            f"{SCALE} must not be negative, found {scales[row].min():.4g} in element {row:,}"
+            f"{SCALE} must not be negative, found {scales[row].min():.4g} in element {row:,} "
+            f"(a draft of the extension, which splat-transform 2.3 wrote, stored logarithms)"
         )
     opacities = rows(OPACITY, "SCALAR")[:, 0]
     bands = range(1, 1 + _degree(file, one))
@@ -283,7 +285,7 @@ def _with_comments(scene: GaussianScene, extras: Any) -> GaussianScene:
         for line in (lines if isinstance(lines, list) else ())
         if isinstance(line, str) and "\n" not in line
     ]
-    tagged = any(map(ANTIALIASED_PATTERN.search, comments))
+    tagged = ANTIALIASED.is_in(comments)
     own = () if tagged else scene.comments
     return replace(scene, comments=(*own, *comments))
 

@@ -1,7 +1,7 @@
 """Read a SOG, version 1 or 2: its ``meta.json`` and the values in its images."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,6 +34,7 @@ from cvtgs.io.sog.container import (
 )
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
+from cvtgs.tags import TWO_SCALES
 
 _MOST_COUNT = 16383**2
 """Pixels of the largest WebP image."""
@@ -63,8 +64,16 @@ class _Root(Document):
     antialias: Any = None  # from the first description of the format
 
 
+def _lacks_at_most_the_first(codes: list[float | None]) -> list[float | None]:
+    if None in codes[1:] or (codes[0] is None and len(codes) < 256):
+        raise ValueError
+    return codes
+
+
 _Codes = Annotated[
-    list[Number], Field(min_length=1, max_length=256, description="1 to 256 finite numbers")
+    list[Number | None],
+    Field(min_length=1, max_length=256, description="1 to 256 finite numbers"),
+    AfterValidator(_lacks_at_most_the_first),
 ]
 
 
@@ -173,6 +182,8 @@ def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
             sh0=_decoded(meta.colors, colors),
             shN=_rest(images, meta),
         )
+    if document.model == "2dgs":
+        return replace(scene_of(arrays), comments=(TWO_SCALES.text,))
     antialiased = document.model == "antialiased" or document.antialias is True
     return scene_of(arrays, antialiased=antialiased)
 
@@ -220,8 +231,11 @@ def _meta_of_version_1(content: Any, where: str) -> _Meta:
 def _meta_of_version_2(content: Any, where: str) -> _Meta:
     document = validated(_Version2, content, where)
 
-    def table(codes: list[float]) -> Float[np.ndarray, "256"]:
-        return np.pad(np.array(codes), (0, 256 - len(codes)), "edge")
+    def table(codes: list[float | None]) -> Float[np.ndarray, "256"]:
+        values = np.array(codes, np.float64)
+        if codes[0] is None:  # some writers left it out; PlayCanvas' engine extrapolates it
+            values[0] = values[1] + (values[1] - values[-1]) / 255
+        return np.pad(values, (0, 256 - len(values)), "edge")
 
     return _Meta(
         document=document,

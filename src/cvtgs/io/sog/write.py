@@ -59,7 +59,7 @@ class EncodedSog(NamedTuple):
 def write_sog(scene: GaussianScene, file: BinaryIO) -> None:
     """Write a bundled SOG of version 2."""
     arrays = arrays_of(scene)
-    encoded = _encoded(arrays, morton_rows(arrays.means), antialiased=scene.antialiased)
+    encoded = _encoded(arrays, morton_rows(arrays.means), scene)
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(zipfile.ZipInfo(META, _TIME), json.dumps(encoded.meta))
         for name, pixels in encoded.images.items():
@@ -84,16 +84,18 @@ def encode_sog(scene: GaussianScene) -> EncodedSog:
             f"every Gaussian must be finite to be written in the order of the scene, found "
             f"{len(scene) - len(arrays.means):,} of {len(scene):,} that are not."
         )
-    return _encoded(arrays, np.arange(len(scene)), antialiased=scene.antialiased)
+    return _encoded(arrays, np.arange(len(scene)), scene)
 
 
-def _encoded(arrays: Arrays, order: Int[np.ndarray, "n"], *, antialiased: bool) -> EncodedSog:
+def _encoded(arrays: Arrays, order: Int[np.ndarray, "n"], scene: GaussianScene) -> EncodedSog:
     scales = codebook(arrays.log_scales[order])
     colors = codebook(arrays.sh0[order])
     opacities = opacity_bytes(arrays.logit_opacities)[order]
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "cvtgs"}, "count": len(order)}
-    if antialiased:
+    if scene.antialiased:
         meta |= {"model": "antialiased", "antialias": True}
+    elif scene.has_two_scales:
+        meta["model"] = "2dgs"
     images, ranges = _means(arrays.means[order])
     images |= {
         "scales": _image(scales.labels),

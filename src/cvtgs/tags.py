@@ -1,0 +1,34 @@
+"""Tags: comments of a file that say how its Gaussians are to be drawn."""
+
+import re
+from collections.abc import Iterable
+from typing import NamedTuple
+
+
+class Tag(NamedTuple):
+    """A tag, as cvtgs writes it and as it recognises it.
+
+    Attributes:
+        text: The comment.
+        pattern: Matches this comment, and those with the same meaning of other tools.
+    """
+
+    text: str
+    pattern: re.Pattern[str]
+
+    def is_in(self, comments: Iterable[str]) -> bool:
+        """Return whether any comment is this tag."""
+        return any(map(self.pattern.search, comments))
+
+    def removed_from(self, comments: Iterable[str]) -> tuple[str, ...]:
+        """Return the other comments."""
+        return tuple(line for line in comments if not self.pattern.search(line))
+
+
+ANTIALIASED = Tag(
+    "SplatRenderMode: mip", re.compile(r"(?im)SplatRenderMode: mip|^\s*antialiased\s+1\s*$")
+)
+"""Scenes that were trained with anti-aliasing (Mip-Splatting). The second text is Postshot's."""
+
+TWO_SCALES = Tag("SplatRenderMode: 2dgs", re.compile(r"(?i)SplatRenderMode: 2dgs"))
+"""Surfels of 2DGS (Huang et al. 2024), as splat-transform marks them: a third scale is ignored."""
