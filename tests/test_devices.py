@@ -23,6 +23,7 @@ from cvtgs.devices import (
     move_together,
     one_thread,
     thread_count,
+    threads_for_chunks,
     usable_device,
     within_memory,
 )
@@ -217,6 +218,37 @@ def test_one_thread_computes_in_the_calling_thread():
     with one_thread():
         found = in_threads(lambda _: threading.get_ident(), range(3), torch.device("cpu"))
         assert set(found) == {threading.get_ident()}
+
+
+def test_threads_are_left_to_chunks(two_threads):
+    def threads(_):
+        return threading.get_ident(), torch.get_num_threads()
+
+    with threads_for_chunks():
+        assert (torch.get_num_threads(), kernel_threads()) == (1, 2)
+        found = list(in_threads(threads, range(4), HOST))
+        assert in_chunks(threads, 5, 10, HOST) == [(threading.get_ident(), 1)]
+        with threads_for_chunks(), one_thread():
+            assert {own for own, _ in in_threads(threads, range(4), HOST)} != {
+                threading.get_ident()
+            }
+    assert threading.get_ident() not in {own for own, _ in found}
+    assert {number for _, number in found} == {1}
+    assert torch.get_num_threads() == 2
+    with one_thread(), threads_for_chunks():  # the program wants one thread
+        assert set(in_threads(threads, range(4), HOST)) == {(threading.get_ident(), 1)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["standard", "matched", "high"])
+def test_results_do_not_depend_on_the_number_of_threads(two_threads, preset):
+    sections = {"refine": {"steps": 4}} if preset == "high" else {}
+    config = cvtgs.SimplifyConfig.from_mapping({"preset": preset, **sections})
+    scene = cvtgs.synthetic.scene("courtyard", 40_000, sh_degree=1, seed=0)
+    simplifier = cvtgs.Simplifier(config=config, device="cpu")
+    two = simplifier.simplify(scene, 0.1)
+    torch.set_num_threads(1)
+    assert same_bits(two, simplifier.simplify(scene, 0.1))
 
 
 def test_ranges_of_rows_cover_all_rows_once_and_an_empty_table_is_one_range():

@@ -44,10 +44,11 @@ _SHORT_CHUNKS = ContextVar("short_chunks", default=False)
 
 
 class _Own(threading.local):
-    """Whether the calling thread uses one thread of torch, and how many its kernels may use."""
+    """Whether the calling thread uses one thread of torch; threads for its kernels and chunks."""
 
     is_limited = False
     spare = 1
+    for_chunks = 1
 
 
 class _Limits:
@@ -195,7 +196,7 @@ def in_threads(
     when requested or earlier.
     """
     with _Limits.lock:
-        threads = torch.get_num_threads()
+        threads = max(torch.get_num_threads(), _OWN.for_chunks)
         if threads == 1 and _Limits.running > 0 and not _OWN.is_limited:
             threads = _Limits.threads  # another call limits torch at the moment
     if device.type != "cpu" or threads == 1 or thread_count() == 1:
@@ -211,6 +212,8 @@ def in_chunks(
     ``length`` is that on a CPU. Without rows, there is one empty range.
     """
     parts = row_chunks(total, length, device) or [slice(0, 0)]
+    if len(parts) == 1:
+        return [function(parts[0])]
     return list(in_threads(function, parts, device))
 
 
@@ -313,6 +316,25 @@ def one_thread() -> Iterator[int]:
             yield before
         finally:
             _OWN.is_limited, _OWN.spare = False, 1
+
+
+@contextmanager
+def threads_for_chunks() -> Iterator[None]:
+    """Leave the threads of torch to chunks (:func:`in_threads`) and to compiled loops.
+
+    After every operation, the threads of torch wait for one another, and spin meanwhile. If other
+    programs use the cores, each wait may last as long as a turn of theirs, some milliseconds, and
+    a call ten times as long as with one thread. Threads for chunks rarely wait.
+    """
+    if _OWN.is_limited:
+        yield
+        return
+    with one_thread() as before:
+        _OWN.for_chunks = before
+        try:
+            yield
+        finally:
+            _OWN.for_chunks = 1
 
 
 def kernel_threads() -> int:

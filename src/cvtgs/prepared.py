@@ -22,7 +22,7 @@ from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shortfall, target_count
-from cvtgs.devices import chosen_device, within_memory, without_autocast
+from cvtgs.devices import chosen_device, threads_for_chunks, within_memory, without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.grouping import OrderedRows, add_neighbors, order_rows
 from cvtgs.mergenet import Checkpoint, Net
@@ -137,7 +137,12 @@ class Prepared:
         Gradients, inference mode and autocast are off, whatever the program has set: results do not
         depend on inputs in a differentiable way, and a refinement needs gradients of its own.
         """
-        with torch.inference_mode(mode=False), torch.no_grad(), without_autocast():
+        with (
+            threads_for_chunks(),
+            torch.inference_mode(mode=False),
+            torch.no_grad(),
+            without_autocast(),
+        ):
             return within_memory(
                 compute,
                 self._device,

@@ -8,7 +8,7 @@ from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock, check_listener
 from cvtgs.config import RefineConfig
 from cvtgs.counts import check_whole
-from cvtgs.devices import chosen_device, without_autocast
+from cvtgs.devices import chosen_device, threads_for_chunks, without_autocast
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer, check_seen
 from cvtgs.progress import ProgressListener, silent
@@ -122,6 +122,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     limits, clock = Limits(seconds, steps=steps), StageClock(listener, place)
     # The program may have disabled gradients, or be in inference mode or autocast.
     with (
+        threads_for_chunks(),
         without_autocast(),
         torch.inference_mode(mode=False),
         torch.enable_grad(),
