@@ -231,3 +231,10 @@ def test_a_uniform_scale_of_a_view_changes_neither_centre_nor_depth():
     images = render(scene, both, depth=True)
     torch.testing.assert_close(images.rgb[1], images.rgb[0])
     torch.testing.assert_close(images.depth[1], images.depth[0])
+
+
+def test_autocast_does_not_move_cameras():
+    eyes, up = random_scene(5).means, torch.tensor([0.0, -1.0, 0.0])
+    wanted = look_at(eyes, eyes + 1, up)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(look_at(eyes, eyes + 1, up), wanted)

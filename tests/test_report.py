@@ -1,12 +1,13 @@
 """The report and the clock that measures stages."""
 
 import json
+from collections.abc import Hashable
 
 import pydantic
 import pytest
 import torch
 
-from cvtgs import ProgressEvent, Simplifier, SimplifyConfig, SimplifyReport
+from cvtgs import ProgressEvent, Simplifier, SimplifyConfig, SimplifyReport, describe
 from cvtgs.clock import StageClock, StageCost, peak_memory_bytes
 from cvtgs.progress import silent
 from scenes import random_scene
@@ -111,3 +112,8 @@ def test_reports_are_frozen_and_refuse_unknown_fields():
 def test_the_silent_listener_prints_nothing(capsys):
     assert silent(ProgressEvent(stage="plan", done=0, total=1)) is None
     assert capsys.readouterr().out == ""
+
+
+def test_records_with_dictionaries_are_not_hashable():
+    assert not isinstance(report_of(), Hashable)
+    assert not isinstance(describe(random_scene(3)), Hashable)

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import math
 import pickle
+import weakref
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import cvtgs
 from cvtgs import GaussianScene
 from cvtgs.errors import DeviceError, InvalidArgumentError, InvalidSceneError, OutputExistsError
 from cvtgs.math.parameters import mean_projected_area
+from render_cases import one_camera
 from scenes import random_scene, same_bits
 
 INF = float("inf")
@@ -359,3 +361,12 @@ def test_scenes_on_two_devices_are_not_joined():
         InvalidSceneError, match="joining needs scenes on one device, found cpu, meta"
     ):
         cvtgs.concatenate([scene, scene.to("meta")])
+
+
+def test_scenes_and_cameras_can_be_keys_of_weak_dictionaries():
+    scene = random_scene(3)
+    cameras = one_camera(4, 4)
+    cache = weakref.WeakKeyDictionary({scene: 1, cameras: 2})
+    assert (cache[scene], cache[cameras]) == (1, 2)
+    del scene, cameras
+    assert not cache

@@ -10,6 +10,7 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import parameters
 from cvtgs.synthetic import gaussians, surfaces, textures
 from cvtgs.synthetic.scenes import allocate
+from scenes import same_bits
 
 SH_C0 = 0.28209479177387814
 
@@ -200,3 +201,10 @@ def test_bad_arguments_are_refused(arguments, text):
     valid = {"kind": "room", "count": 10, "sh_degree": 0, "seed": 0}
     with pytest.raises(InvalidArgumentError, match=text):
         synthetic.scene(**{**valid, **arguments})
+
+
+def test_autocast_does_not_change_scenes():
+    wanted = synthetic.scene("courtyard", 500, seed=3)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = synthetic.scene("courtyard", 500, seed=3)
+    assert same_bits(found, wanted)

@@ -10,13 +10,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.counts import check_whole, whole_number
-from cvtgs.devices import usable_device
+from cvtgs.devices import usable_device, without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.selection import row_numbers
 from cvtgs.text import shown
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class Cameras:
     """Pinhole cameras of one image size.
 
@@ -350,6 +350,7 @@ def spread_rows(length: int, count: int) -> tuple[int, ...]:
     return tuple((k * length) // count for k in range(count))
 
 
+@without_autocast()
 def look_at(
     eyes: Float[Tensor, "c 3"], targets: Float[Tensor, "c 3"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "c 4 4"]:
@@ -361,8 +362,7 @@ def look_at(
         up: Direction that is up in the images, of any length but 0.
 
     Returns:
-        World-to-camera matrices with OpenCV axes. For a camera that looks along ``up``, another
-        direction is taken as up.
+        World-to-camera matrices with OpenCV axes; a camera that looks along ``up`` gets another up.
 
     Raises:
         InvalidArgumentError: A target is at the position of its camera, ``up`` is 0, or a number is

@@ -61,6 +61,8 @@ class SceneInfo(Record):
     extra_columns: tuple[str, ...]
     plan: EffectPlan
 
+    __hash__ = None  # type: ignore[assignment]  # compared by value, and has a dictionary
+
 
 HEAVIEST = (0.001, 0.01, 0.1, 0.5)
 

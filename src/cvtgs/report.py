@@ -147,6 +147,8 @@ class SimplifyReport(CellStatistics):
     refinement: RefineReport | None = None
     config: SimplifyConfig
 
+    __hash__ = None  # type: ignore[assignment]  # compared by value, and has a dictionary
+
     @property
     def seconds(self) -> float:
         """Wall-clock seconds of all stages."""

@@ -10,6 +10,7 @@ from typing import Any, BinaryIO, Literal, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.counts import whole_number
@@ -29,7 +30,7 @@ _NOT_INDEXABLE = (torch.uint16, torch.uint32, torch.uint64)  # torch cannot sele
 _TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class GaussianScene:
     """A 3D Gaussian Splatting scene of ``n`` Gaussians, as files and optimisers store it.
 
@@ -205,7 +206,7 @@ class GaussianScene:
             {name: column.index_select(0, rows) for name, column in self.extras.items()},
         )
 
-    def __getitem__(self, rows: slice | Sequence[int] | Tensor) -> Self:
+    def __getitem__(self, rows: slice | Sequence[int] | NDArray[Any] | Tensor) -> Self:
         """Return some of the Gaussians, as :meth:`select` does.
 
         Args:

@@ -23,9 +23,11 @@ from cvtgs.errors import (
 )
 from cvtgs.io import change_axes, check_output, check_save, losses, scene_file, scene_size
 from cvtgs.io.files import Document, _sentence
+from cvtgs.rendering import blending_weights, contributions, observe
 from cvtgs.views import find_own_cameras
 from format_cases import DATA
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
+from render_cases import one_camera
 from scenes import random_scene
 
 GOOD = ply_bytes(gaussian_properties(), gaussian_rows(gaussian_properties(), 3))
@@ -247,6 +249,9 @@ def test_other_values_than_paths_are_refused(call: Callable[[Any], object]) -> N
         lambda scene: save(scene, "a.ply"),
         lambda scene: change_axes(scene, "rdf", "rub"),
         lambda scene: find_own_cameras(scene, "a.ply"),
+        lambda scene: contributions(scene, one_camera(4, 4)),
+        lambda scene: observe(scene, one_camera(4, 4)),
+        lambda scene: blending_weights(scene, one_camera(4, 4)),
     ],
 )
 @pytest.mark.parametrize("value", [None, {}, "scene.ply"])
@@ -261,3 +266,13 @@ def test_folders_and_versions_of_other_formats_are_not_written(tmp_path: Path) -
     with pytest.raises(InvalidArgumentError, match=r"spz_version needs an \.spz to write, found"):
         save(random_scene(2), tmp_path / "a.ply", spz_version=2)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(os.name == "nt", reason="names of files are UTF-16 there")
+@pytest.mark.parametrize("name", ["a\ud800", "a\0"])
+def test_names_that_no_file_can_have_are_refused(name: str) -> None:
+    for read, suffix in ((load, ".ply"), (load_cameras, ".json")):
+        with pytest.raises(InputNotFoundError):
+            read(f"{name}{suffix}")
+    with pytest.raises(OutputError, match=r"the output must have a valid name"):
+        save(random_scene(2), f"{name}.ply")

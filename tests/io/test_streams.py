@@ -1,5 +1,6 @@
 """Open files, pipes and members of archives as inputs and outputs."""
 
+import errno
 import io
 import json
 import shutil
@@ -347,3 +348,12 @@ def test_no_copy_of_a_stream_is_mapped_when_it_is_removed(
     with pytest.raises(FileFormatError) if is_damaged else nullcontext():
         cvtgs.load(stream)
     assert seen == [[]]
+
+
+def test_a_full_disk_behind_a_stream_is_named() -> None:
+    class Full(io.RawIOBase):
+        def write(self, content: Any) -> int:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OutputError, match="the Full: cannot be written: no space left on device"):
+        cvtgs.save(storable_scene(3, degree=0), Full(), format=".ply")

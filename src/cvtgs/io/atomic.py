@@ -227,7 +227,10 @@ def _is_own(temporary: Path, file: BinaryIO) -> bool:
 
 
 def _target(path: str | os.PathLike[str]) -> Path:
-    return Path(os.path.realpath(path))
+    try:
+        return Path(os.path.realpath(path))
+    except UnicodeEncodeError as error:
+        raise OutputError(f"{shown(path)}: the output must have a valid name: {error}.") from error
 
 
 def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:

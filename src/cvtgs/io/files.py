@@ -46,7 +46,11 @@ _MOST_WHOLE = 1 << 53
 def open_input(path: Path) -> Iterator[BinaryIO]:
     """Open a regular file; system errors, also on reading, become input errors of cvtgs."""
     with input_errors(path):
-        mode = path.stat().st_mode
+        try:
+            mode = path.stat().st_mode
+        except ValueError as error:  # a null byte, or a character that the system cannot encode
+            name = shown(str(path))
+            raise InputNotFoundError(f"{name}: must have the name of a file: {error}.") from error
         if not stat.S_ISREG(mode):  # opening a pipe would wait for ever
             kind = "directory" if stat.S_ISDIR(mode) else "device or a pipe"
             raise InputError(f"{path}: must be a regular file, found a {kind}.")

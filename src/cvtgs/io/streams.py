@@ -166,9 +166,14 @@ def written_to(stream: ByteSink) -> Iterator[BinaryIO]:
         try:
             copy_to(stream, cast(BinaryIO, file))
             getattr(stream, "flush", lambda: None)()
-        except (OSError, TypeError, ValueError) as error:  # ValueError: it is closed
+        except (TypeError, ValueError) as error:  # ValueError: closed, or only for reading
+            found = str(error).rstrip(".")
             raise OutputError(
-                f"{name_of(stream)}: must be open for writing in binary mode, found: {error}."
+                f"{name_of(stream)}: must be open for writing in binary mode, found: {found}."
+            ) from error
+        except OSError as error:
+            raise OutputError(
+                f"{name_of(stream)}: cannot be written: {reason_of(error)}."
             ) from error
 
 

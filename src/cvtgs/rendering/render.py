@@ -15,7 +15,7 @@ from cvtgs.errors import InvalidArgumentError, memory_errors
 from cvtgs.math import parameters
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.rendering.backends import BackendName, BlendingWeights, choose_backend
-from cvtgs.scene import GaussianScene, SceneLike, as_scene
+from cvtgs.scene import GaussianScene, SceneLike, as_scene, check_scene
 from cvtgs.text import shown
 
 
@@ -149,6 +149,7 @@ def contributions(
         >>> tuple(seen.shape), bool((seen >= 0).all()), bool(seen.sum() <= 2 * 32 * 32)
         ((500,), True, True)
     """
+    check_scene(scene)
     chosen = choose_backend(backend, scene.device)[1]
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
     for found in chosen.contributions(scene, checked_cameras(cameras)):
@@ -232,6 +233,7 @@ def observe(
         >>> views.rgb.shape, bool((views.alpha.sum() - views.contributions.sum()).abs() < 1e-2)
         (torch.Size([2, 32, 32, 3]), True)
     """
+    check_scene(scene)
     if len(checked_cameras(cameras)) == 0:
         raise InvalidArgumentError("cameras must hold at least one camera, found none.")
     name, chosen = choose_backend(backend, scene.device)
@@ -279,7 +281,8 @@ def blending_weights(
         >>> weights.paint(torch.ones(500, 3)).shape
         torch.Size([32, 32, 3])
     """
-    if len(camera) != 1:
+    check_scene(scene)
+    if len(checked_cameras(camera)) != 1:
         raise InvalidArgumentError(f"camera must be a single camera, found {len(camera)}.")
     chosen = choose_backend(backend, scene.device)[1]
     return chosen.blending_weights(scene, camera)

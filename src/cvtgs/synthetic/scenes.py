@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from cvtgs.counts import whole_number
-from cvtgs.devices import one_thread
+from cvtgs.devices import one_thread, without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
@@ -100,7 +100,7 @@ def _settings() -> Iterator[None]:
     dtype = torch.get_default_dtype()
     torch.set_default_dtype(torch.float32)
     try:
-        with one_thread(), torch.device("cpu"):
+        with one_thread(), torch.device("cpu"), without_autocast():
             yield
     finally:
         torch.set_default_dtype(dtype)
