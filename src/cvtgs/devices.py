@@ -324,7 +324,8 @@ def threads_for_chunks() -> Iterator[None]:
 
     After every operation, the threads of torch wait for one another, and spin meanwhile. If other
     programs use the cores, each wait may last as long as a turn of theirs, some milliseconds, and
-    a call ten times as long as with one thread. Threads for chunks rarely wait.
+    a call ten times as long as with one thread. Threads for chunks rarely wait. Sums of images then
+    do not depend on the number of threads.
     """
     if _OWN.is_limited:
         yield
@@ -335,6 +336,11 @@ def threads_for_chunks() -> Iterator[None]:
             yield
         finally:
             _OWN.for_chunks = 1
+
+
+def idle_threads_sleep() -> bool:
+    """Return whether idle threads of torch sleep soon, as on the command line (``startup.py``)."""
+    return os.environ.get("OMP_WAIT_POLICY", "").upper() == "PASSIVE"
 
 
 def kernel_threads() -> int:

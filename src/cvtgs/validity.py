@@ -5,10 +5,9 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
-from cvtgs.devices import in_chunks
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError, warn
 from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
@@ -36,10 +35,6 @@ MAX_LOG_SCALE = math.log(MAX_MEAN)
 
 _FAR = 1e6
 """Distance from the origin at which float32 has a resolution of a sixteenth of a unit."""
-
-
-CHUNK = 1 << 16
-"""Rows per chunk of a check, to bound memory."""
 
 
 class CheckedScene(NamedTuple):
@@ -112,7 +107,13 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
     """
     masks: dict[str, Tensor] = {}
     for name, values in scene.tensors().items():
-        masks[name] = values.isnan() if name == "logit_opacities" else _not_finite(values)
+        if name == "logit_opacities":
+            masks[name] = values.isnan()
+            continue
+        # Avoids a boolean array with an entry per value: a finite number times 0 is 0, any other
+        # is NaN, and a sum with a NaN is NaN.
+        parts = values.flatten(start_dim=1).split(1 << 16)
+        masks[name] = torch.cat([(part * 0).sum(dim=1) != 0 for part in parts])
     masks["quats"] |= (scene.quats == 0).all(dim=1)
     if scene.dtype == torch.float64:
         masks["means"] |= (scene.means.abs() > MAX_MEAN).any(dim=1)
@@ -120,20 +121,6 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
     # All masks at once, so that the host synchronises with the device only once.
     any_bad = torch.stack([mask.any() for mask in masks.values()]).tolist()
     return {name: mask for (name, mask), bad in zip(masks.items(), any_bad, strict=True) if bad}
-
-
-def _not_finite(values: Float[Tensor, "n *c"]) -> Bool[Tensor, "n"]:
-    """Return which rows hold a number that is not finite.
-
-    A finite number times 0 is 0, any other is NaN, and a sum with a NaN is NaN: this needs no
-    boolean array with an entry per value.
-    """
-    rows = values.flatten(start_dim=1)
-
-    def not_finite(part: slice) -> Bool[Tensor, "k"]:
-        return (rows[part] * 0).sum(dim=1) != 0
-
-    return torch.cat(in_chunks(not_finite, len(rows), CHUNK, rows.device))
 
 
 def valid_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.devices import in_threads, row_chunks
+from cvtgs.devices import row_chunks
 from cvtgs.math.frames import RobustFrame
 
 VOXEL = 0.04
@@ -94,16 +94,12 @@ def add_depths(
         [1.0]
     """
     voxels = torch.empty(len(means), dtype=torch.int32, device=means.device)
-
-    def depths_in(part: slice) -> tuple[Tensor, Tensor]:
+    for part in row_chunks(len(means), CHUNK, means.device):
         voxel, shrinkage = _voxels_of(means[part], frame)
         voxels[part] = voxel.to(torch.int32)
         depths = masses[part] * (shrinkage / (frame.radius * VOXEL)).square()
         # Integer sums do not depend on the order, so every device gives the same grid.
-        return voxel, (depths.clamp_max(MAX_DEPTH) * FIXED_POINT).round().to(torch.int64)
-
-    chunks = row_chunks(len(means), CHUNK, means.device)
-    for voxel, whole in in_threads(depths_in, chunks, means.device):
+        whole = (depths.clamp_max(MAX_DEPTH) * FIXED_POINT).round().to(torch.int64)
         sums.index_add_(0, voxel, whole)
     return voxels
 

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.checks import checked
-from cvtgs.devices import in_chunks
+from cvtgs.devices import row_chunks
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import SH_C0
 
@@ -46,17 +46,16 @@ def embed(
         >>> embed(torch.ones(1, 3), frame=frame).tolist()
         [[0.5, 0.5, 0.5]]
     """
-
-    def embed_some(part: slice) -> Float[Tensor, "k d"]:
+    colored = sh0 is not None and color > 0.0
+    points = means.new_empty(len(means), 6 if colored else 3)
+    for part in row_chunks(len(means), CHUNK, means.device):
         local = means[part]
-        points = frame.contract(local, contraction) if contraction else frame.normalize(local)
-        points = points.clamp_(-FARTHEST, FARTHEST)
-        if sh0 is not None and color > 0.0:
+        position = frame.contract(local, contraction) if contraction else frame.normalize(local)
+        points[part, :3] = position.clamp_(-FARTHEST, FARTHEST)
+        if sh0 is not None and colored:
             rgb = (SH_C0 * sh0[part, 0].double()).clamp(-0.5, 0.5 + COLOR_HEADROOM)
-            points = torch.cat([points, color * rgb], dim=1)
-        return points.to(means.dtype)
-
-    return torch.cat(in_chunks(embed_some, len(means), CHUNK, means.device))
+            points[part, 3:] = color * rgb
+    return points
 
 
 @checked
