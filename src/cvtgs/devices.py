@@ -209,7 +209,8 @@ def in_chunks(
 ) -> list[Result]:
     """Call a function for consecutive ranges of rows, as :func:`in_threads` does.
 
-    ``length`` is that on a CPU. Without rows, there is one empty range.
+    ``length`` is that on a CPU. Without rows, there is one empty range. The calling thread computes
+    a single range, with all threads of torch.
     """
     parts = row_chunks(total, length, device) or [slice(0, 0)]
     if len(parts) == 1:
