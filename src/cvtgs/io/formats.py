@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, Literal
 import torch
 
 from cvtgs.counts import whole_number
-from cvtgs.devices import usable_device
+from cvtgs.devices import threads_for_chunks, usable_device
 from cvtgs.errors import (
     DroppedDataWarning,
     FileFormatError,
@@ -262,7 +262,7 @@ def save(
         warn(f"{name}: files of this format do not hold {'; '.join(dropped)}.", DroppedDataWarning)
     options = {"version": spz_version, "axes": axes} if suffix == ".spz" else {}
     write: Callable[..., None] = resolve_name(_WRITERS[suffix])
-    with output as file:
+    with output as file, threads_for_chunks():
         write(scene, file, **options)
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cvtgs.devices import HOST, in_threads
 from cvtgs.errors import InvalidSceneError
 from cvtgs.io.arrays import (
     HALF_RANGE,
@@ -50,10 +51,14 @@ class EncodedSog(NamedTuple):
     images: Images
 
     def files(self) -> Iterator[tuple[str, bytes]]:
-        """Yield names and contents, the images first; images are encoded one at a time."""
-        for name, pixels in self.images.items():
-            yield f"{name}.webp", encode_webp(pixels)
+        """Yield names and contents, the images first."""
+        yield from self.encoded_images()
         yield META, json.dumps(self.meta).encode()
+
+    def encoded_images(self) -> Iterator[tuple[str, bytes]]:
+        """Yield names and contents of the images, a few of which are encoded at a time."""
+        contents = in_threads(encode_webp, self.images.values(), HOST)
+        yield from zip((f"{name}.webp" for name in self.images), contents, strict=True)
 
 
 def write_sog(scene: GaussianScene, file: BinaryIO) -> None:
@@ -62,8 +67,8 @@ def write_sog(scene: GaussianScene, file: BinaryIO) -> None:
     encoded = _encoded(arrays, morton_rows(arrays.means), scene)
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(zipfile.ZipInfo(META, _TIME), json.dumps(encoded.meta))
-        for name, pixels in encoded.images.items():
-            archive.writestr(zipfile.ZipInfo(f"{name}.webp", _TIME), encode_webp(pixels))
+        for name, content in encoded.encoded_images():
+            archive.writestr(zipfile.ZipInfo(name, _TIME), content)
 
 
 def encode_sog(scene: GaussianScene) -> EncodedSog:
