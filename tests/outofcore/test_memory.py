@@ -13,20 +13,19 @@ import pytest
 import cvtgs
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.ply import open_rows
-from cvtgs.outofcore import (
-    available_memory,
-    block_count,
-    needed_memory,
-    read_bytes,
-    simplify_file,
-)
+from cvtgs.outofcore import simplify_file
 from cvtgs.outofcore.memory import (
     BASE_BYTES,
     LEAST_BYTES,
+    LIBRARY_BYTES,
     ROOMY_BYTES,
     SMALL_BASE_BYTES,
+    available_memory,
+    block_count,
     cell_room,
     control_group_rooms,
+    needed_memory,
+    read_bytes,
     sample_rows,
 )
 
@@ -139,29 +138,44 @@ def test_little_memory_gives_blocks_without_dividing_by_zero(tmp_path: Path) -> 
 
 
 def test_the_least_memory_is_accepted_and_less_is_refused() -> None:
-    assert read_bytes("400MB") == LEAST_BYTES
-    with pytest.raises(InvalidArgumentError, match=r"at least 400 MB: .*; found '399MB'"):
-        read_bytes("399MB")
+    least = LEAST_BYTES // 10**6
+    assert read_bytes(f"{least}MB") == LEAST_BYTES
+    with pytest.raises(
+        InvalidArgumentError, match=rf"at least {least} MB: .*; found '{least - 1}MB'"
+    ):
+        read_bytes(f"{least - 1}MB")
+
+
+@pytest.mark.parametrize(("build", "least"), [(None, 400), ("13.0", 670)])
+def test_the_build_of_torch_counts(build: str | None, least: int) -> None:
+    program = (
+        f"import torch\ntorch.version.cuda = {build!r}\n"
+        "from cvtgs.outofcore.memory import read_bytes\nread_bytes('300MB')"
+    )
+    words = [sys.executable, "-c", program]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert f"memory must be at least {least} MB" in done.stderr
 
 
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="kilobytes of Linux")
 def test_blocks_stay_within_the_least_memory(tmp_path: Path) -> None:
-    """Not counting torch, scipy and the network, which take 280 MB here and more in GPU builds."""
+    """Not counting the libraries."""
     path = tmp_path / "a.ply"
     cvtgs.save(cvtgs.synthetic.scene("object", 262_144, sh_degree=3), path)
     program = (
         "import resource, sys, scipy.spatial, cvtgs\n"
         "from cvtgs.outofcore import simplify_file\n"
+        "from cvtgs.outofcore.memory import LEAST_BYTES\n"
         "simplifier = cvtgs.Simplifier(device='cpu')\n"
         "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024\n"
         "before = peak()\n"
-        "simplify_file(*sys.argv[1:], 0.01, memory=400_000_000, simplifier=simplifier)\n"
+        "simplify_file(*sys.argv[1:], 0.01, memory=LEAST_BYTES, simplifier=simplifier)\n"
         "print(peak() - before)\n"
     )
     words = [sys.executable, "-c", program, str(path), str(tmp_path / "small.ply")]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
-    assert int(done.stdout) < LEAST_BYTES - 280_000_000
+    assert int(done.stdout) < LEAST_BYTES - LIBRARY_BYTES
 
 
 @pytest.mark.long

@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
+
 from cvtgs.counts import whole_number
 from cvtgs.devices import core_count
 from cvtgs.errors import InvalidArgumentError
@@ -13,16 +15,19 @@ from cvtgs.io.ply import PlyRows
 from cvtgs.outofcore.scan import SAMPLE_ROWS
 from cvtgs.processes import pool_size
 
-BASE_BYTES = 450_000_000
-"""Interpreter, torch and scipy (280 MB), network, sample, grid of depths, and a chunk of rows."""
+LIBRARY_BYTES = 280_000_000 if torch.version.cuda is None else 550_000_000
+"""Interpreter, torch and scipy; torch's build for CUDA loads more when it is imported."""
 
-SMALL_BASE_BYTES = 350_000_000
+BASE_BYTES = LIBRARY_BYTES + 170_000_000
+"""Libraries, network, sample, grid of depths, and a chunk of rows."""
+
+SMALL_BASE_BYTES = LIBRARY_BYTES + 70_000_000
 """The same with a quarter of the sample, for less memory than ``ROOMY_BYTES``."""
 
-ROOMY_BYTES = 500_000_000
+ROOMY_BYTES = LIBRARY_BYTES + 220_000_000
 """With less memory than this, the sample is small."""
 
-LEAST_BYTES = 400_000_000
+LEAST_BYTES = LIBRARY_BYTES + 120_000_000
 """Minimum memory of a run in blocks: the small base and a small block."""
 
 IMAGE_BYTES = 400_000_000
@@ -45,21 +50,7 @@ _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 
 
 def read_bytes(text: str) -> int:
-    """Read an amount of memory.
-
-    Args:
-        text: A number with a unit: kB, MB, GB or TB (powers of 1000), KiB, MiB, GiB or TiB.
-
-    Returns:
-        Bytes.
-
-    Raises:
-        InvalidArgumentError: The text is not an amount, or the amount is too small.
-
-    Example:
-        >>> read_bytes("4GB"), read_bytes("1.5 GiB")
-        (4000000000, 1610612736)
-    """
+    """Read an amount of memory in bytes, such as 4GB (powers of 1000) or 1.5 GiB."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([KMGT]?)(I?)B?\s*", text.upper())
     if not match:
         raise InvalidArgumentError(f"memory must be an amount such as 4GB, found {text!r}.")
@@ -69,7 +60,8 @@ def read_bytes(text: str) -> int:
     amount = int(float(match[1]) * unit)
     if amount < LEAST_BYTES:
         raise InvalidArgumentError(
-            f"memory must be at least {LEAST_BYTES / 1e6:g} MB: torch and scipy take 280 MB, "
+            f"memory must be at least {LEAST_BYTES / 1e6:g} MB: torch and scipy take "
+            f"{LIBRARY_BYTES / 1e6:g} MB, "
             f"and the sample, the grids and a small block need the rest; found {text!r}."
         )
     return amount
@@ -80,13 +72,6 @@ def available_memory() -> int:
 
     This is the minimum of the free memory of the machine, the memory left in the control groups
     (versions 1 and 2) of a container or a job, and the limit of the process (``ulimit -v``).
-
-    Returns:
-        Bytes.
-
-    Example:
-        >>> available_memory() > 0
-        True
     """
     import psutil  # noqa: PLC0415 (loaded when it is used)
 
@@ -181,19 +166,10 @@ def sample_rows(memory: int) -> int:
 
 
 def needed_memory(source: PlyRows, rows: int, *, merging: int = 0) -> int:
-    """Estimate the memory needed to simplify some rows at once.
+    """Estimate the bytes needed to simplify some rows at once.
 
     Measured without view-dependent colour (``python -m benchmarks.memory``): 410 bytes per Gaussian
     at rho 0.01, 630 where pairs merge from single Gaussians; with degree 3, 450 and 860.
-
-    Args:
-        source: The file.
-        rows: Number of its rows.
-        merging: Number of cells, or single Gaussians, that merge in pairs at once
-            (:func:`cvtgs.grouping.finer_count`).
-
-    Returns:
-        Bytes.
     """
     return BASE_BYTES + rows * (290 + 2 * source.dtype.itemsize) + merging * MERGING_BYTES
 
@@ -211,18 +187,9 @@ def cell_room(memory: int | None) -> int:
 
 
 def block_count(source: PlyRows, memory: int, *, merging: int = 0) -> int:
-    """Choose the number of blocks, so that any one of them fits into memory.
+    """Choose the number of blocks, so that any one of them fits: 1, or a multiple of SHARED_BY.
 
     A block holds at most twice the mean number of rows (:func:`cvtgs.outofcore.scan.scan_scene`).
-
-    Args:
-        source: The file.
-        memory: Bytes.
-        merging: Number of cells, or single Gaussians, that merge in pairs at once if the file is
-            simplified in one piece.
-
-    Returns:
-        1 if the whole file fits, else a multiple of ``SHARED_BY``.
     """
     base = min(BASE_BYTES, base_bytes(memory))
     if base + needed_memory(source, source.count, merging=merging) - BASE_BYTES <= memory:
@@ -233,18 +200,8 @@ def block_count(source: PlyRows, memory: int, *, merging: int = 0) -> int:
 
 
 def worker_count(memory: int, wanted: int | None = None) -> int:
-    """Choose the number of processes that work on blocks.
+    """Choose the number of processes that work on blocks: one per core, if none is wanted.
 
-    Args:
-        memory: Bytes for all processes together.
-        wanted: The wanted number; None for one per core.
-
-    Returns:
-        At least 1, and at most one per GB, which torch and a block of some size need; on Windows,
-        at most 61.
-
-    Example:
-        >>> worker_count(4_000_000_000, 8)
-        4
+    There is at most one per GB, which torch and a block of some size need; on Windows at most 61.
     """
     return pool_size(max(1, min(wanted or core_count(), memory // (2 * ROOMY_BYTES))))
