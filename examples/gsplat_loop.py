@@ -6,6 +6,7 @@ With CUDA and gsplat, gsplat.rasterization renders the images; otherwise cvtgs.r
 """
 
 import argparse
+from collections.abc import Mapping
 
 import torch
 
@@ -41,10 +42,16 @@ def main() -> None:
             print(f"step {step}: loss {loss.item():.5f}")
 
 
-def image(splats: dict[str, torch.Tensor], views: cvtgs.Cameras) -> torch.Tensor:
+def image(splats: Mapping[str, torch.Tensor], views: cvtgs.Cameras) -> torch.Tensor:
     """Render the parameters of a model differentiably, by gsplat where it works."""
-    names = {"scales": "log_scales", "opacities": "logit_opacities"}
-    scene = cvtgs.GaussianScene(**{names.get(key, key): values for key, values in splats.items()})
+    scene = cvtgs.GaussianScene(
+        means=splats["means"],
+        quats=splats["quats"],
+        log_scales=splats["scales"],
+        logit_opacities=splats["opacities"],
+        sh0=splats["sh0"],
+        shN=splats["shN"],
+    )
     return cvtgs.render(scene, views, backend="auto").rgb
 
 
