@@ -20,7 +20,7 @@ import cvtgs
 from benchmarks.measuring import fastest, machine, renew_tables, run_python
 from benchmarks.quality import score_views
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
-from cvtgs.analysis import BAND_LOSS, band_losses, duplicate_share, far_share, haze_share
+from cvtgs.analysis.effects import BAND_LOSS, band_losses, duplicate_share, far_share, haze_share
 from cvtgs.clock import peak_memory_bytes
 from cvtgs.math.frames import robust_frame
 from cvtgs.scene import FLAT_LOG_SCALE

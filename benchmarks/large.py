@@ -22,7 +22,8 @@ import torch
 import cvtgs
 from benchmarks.measuring import cores, machine, run_python
 from benchmarks.quality import score_views
-from cvtgs.outofcore import read_bytes, simplify_file
+from cvtgs.outofcore import simplify_file
+from cvtgs.outofcore.memory import read_bytes
 from cvtgs.views import automatic_views
 
 RATIOS, RUNS = (0.1, 0.01, 0.001), 3

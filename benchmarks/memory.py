@@ -11,7 +11,7 @@ from benchmarks.measuring import generated_scenes, machine, run_python
 from cvtgs import SimplifyConfig, target_count
 from cvtgs.grouping import finer_count
 from cvtgs.io.ply import open_rows
-from cvtgs.outofcore import needed_memory
+from cvtgs.outofcore.memory import needed_memory
 
 SCENES = (
     ("courtyard", 1_000_000, 0),

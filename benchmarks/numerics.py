@@ -17,7 +17,8 @@ from torch import Tensor
 import cvtgs
 from benchmarks.measuring import fastest, machine, renew_tables
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
-from cvtgs.cells import Partition, gather_members, mean_and_covariance, merge_cells
+from cvtgs.cells import Partition, merge_cells
+from cvtgs.cells.merge import gather_members, mean_and_covariance
 from cvtgs.config import MergeConfig
 from cvtgs.cvt import embed, nearest_neighbors, tessellate
 from cvtgs.math import parameters

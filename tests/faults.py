@@ -64,7 +64,7 @@ def started(command: Command, folder: Path, *, limit: Callable[[], None] | None 
         # Optimizers of torch create this folder, by default in that for temporary files.
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(folder.parent / "torch")
         if command.blocks:
-            cvtgs.outofcore.block_count = lambda *_, **__: command.blocks  # type: ignore[assignment]
+            cvtgs.outofcore.memory.block_count = lambda *_, **__: command.blocks  # type: ignore[assignment]
             sys.modules["cvtgs.outofcore.run"].block_count = lambda *_, **__: command.blocks  # type: ignore[attr-defined]
         if limit is not None:
             limit()

@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.analysis import SceneAnalysis, drawn_rows, perspective_falloff
+from cvtgs.analysis import SceneAnalysis, perspective_falloff
+from cvtgs.analysis.effects import drawn_rows
 from cvtgs.checks import check_range, checked
 from cvtgs.config import FilterConfig
 from cvtgs.counts import check_share, check_whole
@@ -15,7 +16,7 @@ from cvtgs.math.parameters import divide
 from cvtgs.math.segments import running_sums, true_rows
 from cvtgs.scene import GaussianScene
 
-__all__ = ["FLYAWAY_RADII", "FilteredRows", "filter_rows", "flyaway_rows", "visible_rows"]
+__all__ = ["FilteredRows", "filter_rows", "flyaway_rows", "visible_rows"]
 
 FLYAWAY_RADII = 100.0
 """Distance beyond which a Gaussian may be a flyaway, in robust radii; no sky lies so far."""

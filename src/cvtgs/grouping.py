@@ -12,6 +12,7 @@ from torch import Tensor
 from cvtgs import cells, cvt
 from cvtgs.analysis import SceneAnalysis
 from cvtgs.config import AllocationConfig, SimplifyConfig
+from cvtgs.cvt.nearest import search_device
 from cvtgs.devices import move_together
 from cvtgs.filters import filter_rows
 from cvtgs.math.frames import RobustFrame, morton_order
@@ -172,7 +173,7 @@ def allocate(
     groups = members if is_own else cells.group_moments(members, labels, count)
     merged = torch.arange(count, device=labels.device)
     if count > target:
-        groups = cells.Moments(*move_together(groups, cvt.search_device(labels.device)))
+        groups = cells.Moments(*move_together(groups, search_device(labels.device)))
         neighbors = points.neighbors if is_own else None
         if neighbors is None:
             neighbors = cvt.nearest_neighbors(groups.means.T, config.neighbors)
@@ -303,5 +304,5 @@ def add_neighbors(ordered: OrderedRows, target: int, config: AllocationConfig) -
     if not from_singles or points.neighbors is not None or points.moments is None:
         return ordered
     means = points.moments.means
-    near = cvt.nearest_neighbors(means.T.to(cvt.search_device(means.device)), config.neighbors)
+    near = cvt.nearest_neighbors(means.T.to(search_device(means.device)), config.neighbors)
     return ordered._replace(points=points._replace(neighbors=near))

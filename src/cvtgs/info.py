@@ -4,7 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.analysis import EffectPlan, analyze, select_columns
+from cvtgs.analysis import EffectPlan, analyze
+from cvtgs.analysis.analyze import select_columns
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError

@@ -21,7 +21,7 @@ from cvtgs.io.files import open_input
 from cvtgs.report import Level
 from cvtgs.text import printable
 
-__all__ = ["INDEX_NAME", "LevelEntry", "LevelsIndex", "add_scores", "level_names", "write_levels"]
+__all__ = ["LevelEntry", "LevelsIndex", "write_levels"]
 
 INDEX_NAME = "levels.json"
 """Name of the index file, in the folder of the levels."""
@@ -134,19 +134,7 @@ class LevelsIndex(Record):
 
 
 def level_names(rhos: Sequence[float], suffix: str = ".ply") -> tuple[str, ...]:
-    """Return the file names of levels.
-
-    Args:
-        rhos: Ratios.
-        suffix: File suffix, which selects the format.
-
-    Returns:
-        One name per ratio.
-
-    Example:
-        >>> level_names([0.1, 0.001])
-        ('rho_0.1.ply', 'rho_0.001.ply')
-    """
+    """Return the file names of levels, one per ratio."""
     return tuple(f"rho_{written(rho)}{suffix}" for rho in rhos)
 
 
@@ -239,33 +227,7 @@ def write_levels(
 
 
 def add_scores(folder: str | os.PathLike[str], evaluation: Evaluation) -> LevelsIndex:
-    """Add scores to the index of levels on disk.
-
-    Args:
-        folder: Folder that :func:`write_levels` wrote to.
-        evaluation: Scores of the files, by file name.
-
-    Returns:
-        The index with scores, as it is now in the folder.
-
-    Raises:
-        InputNotFoundError: There is no index.
-        FileFormatError: The index is not one that :func:`write_levels` wrote.
-        OutputError: The index cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> import cvtgs
-        >>> scene = cvtgs.synthetic.scene("object", 500)
-        >>> levels = cvtgs.Simplifier(device="cpu").levels(scene, [0.1])
-        >>> views = cvtgs.views.automatic_views(scene, 2, width=32, height=24)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     index = write_levels(levels, folder, rhos=[0.1], source="object", suffix=".spz")
-        ...     files = {"rho_0.1.spz": cvtgs.load(f"{folder}/rho_0.1.spz")}
-        ...     index = add_scores(folder, cvtgs.evaluate(scene, files, views))
-        >>> index.views, index.levels[0].psnr is None
-        (2, False)
-    """
+    """Add scores to the index of levels on disk."""
     place = Path(folder)
     index = read_index(place / INDEX_NAME)
     scores = {one.name: one for one in evaluation.scenes}

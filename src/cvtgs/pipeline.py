@@ -16,16 +16,18 @@ from cvtgs import cells, cvt
 from cvtgs.analysis import SceneAnalysis, drop_unused_bands, restore_columns
 from cvtgs.clock import StageClock
 from cvtgs.config import MergeConfig, SimplifyConfig
+from cvtgs.cvt.nearest import search_name
 from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
 from cvtgs.grouping import OrderedRows, allocate, collect_cells, tessellate_rows, weigh_rows
 from cvtgs.math.segments import segment_ids
-from cvtgs.mergenet import Net, correct_cells
+from cvtgs.mergenet import correct_cells
+from cvtgs.mergenet.published import Net
 from cvtgs.report import CellStatistics, MatchReport
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities
 
-__all__ = ["Merged", "Reduced", "level_facts", "merge_and_inflate", "reduce_scene"]
+__all__ = ["Merged", "Reduced", "merge_and_inflate", "reduce_scene"]
 
 NEIGHBORS = 8
 """Number of neighbouring cells that may cover the ends of a cell, and that the network sees."""
@@ -138,7 +140,7 @@ def reduce_scene(
         refilled_cells=refilled,
         energies=energies,
         energy=energy,
-        backend=cvt.search_name(scene.device),
+        backend=search_name(scene.device),
     )
     return Reduced(small, statistics, partition)
 

@@ -9,15 +9,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from cvtgs.analysis import (
-    SceneAnalysis,
-    analyze,
-    drop_mip_tag,
-    drop_unused_bands,
-    measure_visibility,
-    restore_columns,
-    select_columns,
-)
+from cvtgs.analysis import SceneAnalysis, analyze, drop_unused_bands, restore_columns
+from cvtgs.analysis.analyze import drop_mip_tag, measure_visibility, select_columns
 from cvtgs.boxes import MaskLike, check_room, checked_mask
 from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock
@@ -32,7 +25,8 @@ from cvtgs.devices import (
 )
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.grouping import OrderedRows, add_neighbors, order_rows
-from cvtgs.mergenet import Checkpoint, Net
+from cvtgs.mergenet import Checkpoint
+from cvtgs.mergenet.published import Net
 from cvtgs.pipeline import Reduced, level_facts, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified, SimplifyReport, origin_of_views
@@ -363,7 +357,8 @@ class Prepared:
         return self._refine(result, analysis)
 
     def _refine(self, result: Simplified, analysis: SceneAnalysis) -> Simplified:
-        from cvtgs.refinement import join_reports, refine  # noqa: PLC0415 (most never need it)
+        from cvtgs.refinement import refine  # noqa: PLC0415 (most never need it)
+        from cvtgs.refinement.refine import join_reports  # noqa: PLC0415 (most never need it)
 
         choices, plan, kept = self._config.effects, analysis.plan, result.report.kept_count
         reduce_bands = drop_mip_tag if kept else drop_unused_bands

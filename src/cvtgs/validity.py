@@ -13,15 +13,10 @@ from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 
 __all__ = [
-    "MAX_LOG_SCALE",
-    "UNIT_TOLERANCE",
     "CheckedScene",
     "check_rows",
     "invalid_rows",
     "standardized",
-    "valid_rows",
-    "with_finite_opacities",
-    "writable_rows",
 ]
 
 UNIT_TOLERANCE = 1e-5
@@ -124,19 +119,7 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
 
 
 def valid_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
-    """Return a mask of the rows that renderers can draw.
-
-    Args:
-        scene: Any scene.
-
-    Returns:
-        Mask of the valid rows.
-
-    Example:
-        >>> from cvtgs.synthetic import scene
-        >>> bool(valid_rows(scene("object", 10, sh_degree=0, seed=0)).all())
-        True
-    """
+    """Return a mask of the rows that renderers can draw."""
     return ~any_row(scene, invalid_rows(scene))
 
 
@@ -153,14 +136,7 @@ def valid_part(scene: GaussianScene) -> GaussianScene:
 
 
 def writable_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
-    """Return a mask of the rows that compact formats can hold.
-
-    Args:
-        scene: Any scene.
-
-    Returns:
-        Mask of rows that are finite in float32 and whose quaternion is not zero.
-    """
+    """Return a mask of the rows that compact formats can hold."""
     rows = ~scene.logit_opacities.isnan() & (scene.quats != 0).any(dim=1)
     for name, tensor in scene.tensors().items():
         if name != "logit_opacities" and tensor.numel():
@@ -169,20 +145,7 @@ def writable_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
 
 
 def with_finite_opacities(scene: GaussianScene) -> GaussianScene:
-    """Replace infinite opacity logits, which are valid input, by the largest finite ones.
-
-    Args:
-        scene: A scene with valid rows.
-
-    Returns:
-        The scene; the same object if there is nothing to replace.
-
-    Example:
-        >>> from cvtgs.synthetic import scene as make
-        >>> scene = make("object", 10, sh_degree=0, seed=0)
-        >>> with_finite_opacities(scene) is scene
-        True
-    """
+    """Replace infinite opacity logits, which are valid input, by the largest finite ones."""
     logits = scene.logit_opacities
     infinite = logits.isinf()
     if not bool(infinite.any()):

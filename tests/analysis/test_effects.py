@@ -8,15 +8,17 @@ import pytest
 import torch
 
 from cvtgs import EffectPlan, GaussianScene, SimplifyConfig
-from cvtgs.analysis import (
+from cvtgs.analysis import plan_effects
+from cvtgs.analysis.analyze import drop_mip_tag, select_columns
+from cvtgs.analysis.effects import (
     BAND_LOSS,
     DUPLICATE_SHARE,
     UNBOUNDED_DISTANCE,
     UNBOUNDED_SHARE,
     band_losses,
+    drawn_rows,
     duplicate_share,
     far_share,
-    plan_effects,
 )
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.spherical_harmonics import REST_COUNTS, evaluate
@@ -304,3 +306,19 @@ def test_a_plan_is_frozen():
     plan = plan_of(random_scene(50))
     with pytest.raises(pydantic.ValidationError):
         plan.extras = plan.unbounded
+
+
+def test_gaussians_that_images_cannot_show_are_not_drawn():
+    assert drawn_rows(torch.tensor([0.001, 0.5])).tolist() == [False, True]
+    assert drawn_rows(torch.tensor([0.001, 0.002])).tolist() == [True, True]  # a scene needs some
+
+
+def test_forced_choices_drop_bands_columns_and_the_tag():
+    tag, labels = ("SplatRenderMode: mip",), {"label": torch.arange(10)}
+    scene = replace(random_scene(10), extras=labels, comments=tag)
+    assert select_columns(scene, SimplifyConfig().effects) is scene
+    choices = SimplifyConfig.from_mapping({"effects": {"sh": 1, "extras": "off"}}).effects
+    chosen = select_columns(scene, choices)
+    assert (chosen.sh_degree, dict(chosen.extras)) == (1, {})
+    assert drop_mip_tag(scene, plan_of(scene)) is scene
+    assert not drop_mip_tag(scene, plan_of(scene, mip="off")).antialiased

@@ -8,7 +8,8 @@ import torch
 
 import cvtgs
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig, filters, pipeline
-from cvtgs.analysis import analyze, measure_visibility
+from cvtgs.analysis import analyze
+from cvtgs.analysis.analyze import measure_visibility
 from cvtgs.cells import features
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import REST_COUNTS

@@ -7,6 +7,12 @@ import torch
 from torch import Tensor
 
 from cvtgs.analysis import ambient_visibility
+from cvtgs.analysis.visibility import (
+    add_depths,
+    empty_depth_grid,
+    visibility_at,
+    visibility_grid,
+)
 from cvtgs.math.frames import RobustFrame
 
 ORIGIN = torch.zeros(3, dtype=torch.float64)
@@ -104,3 +110,15 @@ def test_flyaways_are_fully_visible_and_hide_nothing(far):
     points[1:, 0] = far
     found = ambient_visibility(points, torch.tensor([1.0, 1e30, 1.0]).double(), UNIT)
     assert found.tolist() == [1.0, 1.0, 1.0]
+
+
+def test_parts_of_a_scene_add_up_to_the_same_grid():
+    means = torch.randn(5000, 3, generator=torch.Generator().manual_seed(0)).double()
+    masses = torch.full((5000,), 1e-3).double()
+    sums = empty_depth_grid(means.device)
+    for rows in (slice(3000, None), slice(None, 3000)):
+        add_depths(sums, means[rows], masses[rows], UNIT)
+    found = visibility_at(visibility_grid(sums), means, UNIT)
+    assert torch.equal(found, ambient_visibility(means, masses, UNIT))
+    assert found.amin() < 0.9
+    assert float(visibility_grid(empty_depth_grid(means.device)).amin()) == 1.0

@@ -9,9 +9,9 @@ import torch
 import mergenet_oracle as oracle
 import oracles
 from cvtgs import GaussianScene
-from cvtgs.cells import describe_cells, sample_members
+from cvtgs.cells import describe_cells
 from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES
-from cvtgs.cells.partition import MOST_SAMPLED
+from cvtgs.cells.partition import MOST_SAMPLED, sample_members
 from cvtgs.math.segments import segment_sum
 from mergenet_cases import (
     Case,

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from cvtgs import GaussianScene
-from cvtgs.cells import Partition, merge_cells, normalized_weights
+from cvtgs.cells import Partition, merge_cells
+from cvtgs.cells.merge import normalized_weights
 from cvtgs.config import SimplifyConfig
 from scenes import assert_standard, covariances_of, moved, random_scene
 

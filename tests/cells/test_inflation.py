@@ -9,7 +9,8 @@ from torch import Tensor
 
 import oracles
 from cvtgs import GaussianScene
-from cvtgs.cells import Partition, align_axes, inflate_cells, side_cover
+from cvtgs.cells import Partition, align_axes, inflate_cells
+from cvtgs.cells.inflate import side_cover
 from cvtgs.config import MergeConfig
 from cvtgs.cvt import nearest_neighbors
 from cvtgs.math import parameters

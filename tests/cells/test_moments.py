@@ -8,13 +8,9 @@ import torch
 
 import oracles
 from cvtgs import GaussianScene
-from cvtgs.cells import (
-    Partition,
-    gather_members,
-    mean_and_covariance,
-    merge_cells,
-    merged_depth,
-)
+from cvtgs.cells import Partition, merge_cells
+from cvtgs.cells.merge import gather_members, mean_and_covariance, merged_depth
+from cvtgs.cells.moments import mass_unit
 from cvtgs.config import MergeConfig
 from cvtgs.math import depths, parameters
 from cvtgs.tags import ANTIALIASED
@@ -191,3 +187,8 @@ def test_order_of_members_does_not_matter(config):
     assert_same_gaussians(
         merged(scene, cells, config), merged(scene.select(shuffle), other, config), tolerance=1e-9
     )
+
+
+def test_a_few_giants_do_not_set_the_unit_of_masses():
+    assert float(mass_unit(torch.tensor([1.0, 1.0, 7.0]), 3.0)) == 3.0
+    assert float(mass_unit(torch.ones(3), 1e60)) == 1e6

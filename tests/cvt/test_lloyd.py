@@ -3,15 +3,8 @@
 import pytest
 import torch
 
-from cvtgs.cvt import (
-    centroids,
-    fill_empty_cells,
-    lloyd,
-    nearest_scipy,
-    stratified_seeds,
-    weighted_seeds,
-    weighted_sums,
-)
+from cvtgs.cvt import fill_empty_cells, lloyd, nearest_scipy, stratified_seeds, weighted_seeds
+from cvtgs.cvt.tessellate import centroids, weighted_sums
 from cvtgs.math.frames import morton_order
 
 BACKENDS = {"scipy": nearest_scipy}

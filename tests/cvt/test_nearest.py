@@ -7,8 +7,9 @@ import pytest
 import torch
 
 import oracles
-from cvtgs.cvt import nearest_neighbors, nearest_scipy, nearest_several, nearest_site
+from cvtgs.cvt import nearest_neighbors, nearest_scipy, nearest_site
 from cvtgs.cvt.device_search import nearest_in_tiles
+from cvtgs.cvt.nearest import nearest_several
 from cvtgs.errors import InvalidArgumentError
 
 
@@ -190,8 +191,6 @@ NOT_FINITE = torch.tensor([[0.0, torch.nan], [0.0, 1.0]])
         (lambda: nearest_neighbors(PLANE / 0, 1), "points and sites must be finite"),
         (lambda: nearest_neighbors(PLANE, -1), "count must be a whole number at least 0, found "
          "-1."),
-        (lambda: nearest_several(PLANE, PLANE, 0), "count must be a whole number above 0, found "
-         "0."),
     ],
 )  # fmt: skip
 def test_wrong_arguments(call, text):

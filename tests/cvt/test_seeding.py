@@ -5,7 +5,8 @@ from inspect import unwrap
 import pytest
 import torch
 
-from cvtgs.cvt import sample_points, stratified_seeds, weighted_seeds
+from cvtgs.cvt import stratified_seeds, weighted_seeds
+from cvtgs.cvt.tessellate import sample_points
 
 
 def weights_of(kind: str, count: int) -> torch.Tensor:

@@ -12,11 +12,9 @@ from cvtgs.cvt import (
     fill_empty_cells,
     lloyd,
     nearest_site,
-    sample_points,
     stratified_seeds,
     tessellate,
     weighted_seeds,
-    weighted_sums,
 )
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.frames import morton_order
@@ -221,14 +219,9 @@ def many_iterations(**changes):
         (lambda: stratified_seeds(W, 0), "20 points, found 0."),
         (lambda: weighted_seeds(W, 21, torch.Generator()), "20 points, found 21."),
         (lambda: weighted_seeds(-W, 5, torch.Generator()), "weights must be finite"),
-        (lambda: sample_points(P, W, -1), "size must be a whole number at least 0, found -1."),
         (lambda: many_iterations(iterations=-1), "iterations must be a whole number at least 0"),
         (lambda: many_iterations(weights=-W), "points and weights must be finite, and weights at "
          "least 0, found an energy of -"),
-        (lambda: weighted_sums(P, W, LABELS + 7, 5), "labels must be between 0 and 4, found 7 to "
-         "7."),
-        (lambda: weighted_sums(P, W, LABELS.double(), 5), "labels must be a tensor of signed "
-         "integers of shape (20,), found torch.float64 of shape (20,)."),
         (lambda: fill_empty_cells(LABELS, W, W, 21), "20 points, found 21."),
         (lambda: fill_empty_cells(LABELS - 1, W, W, 5), "labels must be between 0 and 4"),
     ],

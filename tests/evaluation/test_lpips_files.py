@@ -16,7 +16,8 @@ from cvtgs.errors import (
     InvalidArgumentError,
     MissingDependencyError,
 )
-from cvtgs.evaluation import LPIPS_VARIABLE, LpipsWeights, load_lpips, lpips
+from cvtgs.evaluation import LpipsWeights, load_lpips, lpips
+from cvtgs.evaluation.lpips import LPIPS_VARIABLE
 from lpips_cases import random_images, random_state, random_weights
 
 

@@ -10,8 +10,7 @@ import oracles
 from cvtgs import render
 from cvtgs.cells import Partition, merge_cells
 from cvtgs.config import SimplifyConfig
-from cvtgs.mergenet import PublishedMergeNet, load_checkpoint
-from cvtgs.mergenet.model import summarize
+from cvtgs.mergenet import PublishedMergeNet, load_checkpoint, summarize
 from hard_cases import CASES, each_case
 from hard_scenes import DEVICES, PRESETS, dtypes, valid_case
 from mergenet_cases import Case, are_corrected, case_of, features_of, lively_net

@@ -187,3 +187,12 @@ def test_gradients_of_known_rows():
     ends = torch.tensor([0, 2, 5])
     (segments.segment_max(values, ends) * torch.tensor([10.0, 20.0])).sum().backward()
     assert values.grad.tolist() == [0.0, 10.0, 10.0, 0.0, 10.0]
+
+
+def test_sums_and_rows_of_scattered_columns():
+    columns, labels = [torch.tensor([1.0, 2.0, 4.0]), torch.ones(3)], torch.tensor([1, 0, 1])
+    weights = torch.tensor([1.0, 2.0, 3.0]).double()
+    found = segments.label_sums(iter(columns), labels, 3, weights)
+    assert found.tolist() == [[4.0, 13.0, 0.0], [2.0, 4.0, 0.0]]
+    (rows,) = segments.gather_columns(torch.tensor([2, 0]), torch.eye(3))
+    assert rows.tolist() == [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]

@@ -17,8 +17,8 @@ from cvtgs.cells.descriptors import (
     PAIR_FEATURES,
     PIXEL_SCALE,
 )
-from cvtgs.mergenet import Architecture, KnownRange, MergeNet, Residuals, summarize
-from cvtgs.mergenet.model import MARGIN, MEMBERS, NARROWEST, SUMMARY_FEATURES
+from cvtgs.mergenet import Architecture, KnownRange, MergeNet, Residuals
+from cvtgs.mergenet.model import MARGIN, MEMBERS, NARROWEST, SUMMARY_FEATURES, summarize
 from mergenet_cases import case_of, fields_of, lively_net, some_case, some_labels
 from scenes import random_scene
 

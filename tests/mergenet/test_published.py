@@ -18,12 +18,12 @@ from cvtgs.mergenet import (
     CheckpointInfo,
     PublishedArchitecture,
     PublishedMergeNet,
-    compose_published,
     correct_cells,
-    describe_published,
     load_checkpoint,
     save_checkpoint,
 )
+from cvtgs.mergenet.apply import compose_published
+from cvtgs.mergenet.published import describe_published
 from mergenet_cases import Case, lively_net, some_case
 from scenes import random_scene, same_bits
 

@@ -18,9 +18,9 @@ from cvtgs.errors import ConfigError, FileFormatError, InvalidArgumentError, Inv
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.io.ply import open_rows
 from cvtgs.math.frames import robust_frame
-from cvtgs.outofcore import allocate, block_count, read_bytes, simplify_file
+from cvtgs.outofcore import allocate, simplify_file
 from cvtgs.outofcore import scan as scan_module
-from cvtgs.outofcore.memory import needed_memory
+from cvtgs.outofcore.memory import block_count, needed_memory, read_bytes
 from cvtgs.outofcore.scan import (
     RangeTotals,
     RowRange,
@@ -360,7 +360,7 @@ def test_the_command_cuts_the_scene_if_memory_is_low(source, tmp_path, capsys, m
     assert (report["output_count"], report["blocks"]) == (60, 8)
     assert main([*words, "--memory", "7MB"]) == 0
     assert "blocks" not in capsys.readouterr().out
-    monkeypatch.setattr("cvtgs.outofcore.available_memory", lambda: 3_000_000)
+    monkeypatch.setattr("cvtgs.outofcore.memory.available_memory", lambda: 3_000_000)
     assert main(words) == 0
     assert "In 8 blocks." in capsys.readouterr().out
     assert main([*words, "--memory", "2MB", "--refine", "3"]) == 1

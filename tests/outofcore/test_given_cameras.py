@@ -11,7 +11,7 @@ import cvtgs
 from block_jobs import unfinished_job
 from camera_files import transforms, write_json
 from cvtgs import Simplifier, SimplifyConfig
-from cvtgs.analysis import visibility_cameras
+from cvtgs.analysis.analyze import visibility_cameras
 from cvtgs.cameras import Cameras
 from cvtgs.cli.main import main
 from cvtgs.errors import InvalidArgumentError
@@ -188,7 +188,7 @@ def test_cameras_are_part_of_the_key_of_a_job(scene, tmp_path):
 
 @pytest.fixture
 def two_blocks(monkeypatch):
-    for module in ("cvtgs.outofcore", "cvtgs.outofcore.run"):
+    for module in ("cvtgs.outofcore.memory", "cvtgs.outofcore.run"):
         monkeypatch.setattr(f"{module}.block_count", lambda rows, memory, merging: BLOCKS)
 
 

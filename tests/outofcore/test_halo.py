@@ -10,7 +10,7 @@ import cvtgs
 from block_jobs import unfinished_job
 from cvtgs import SimplifyConfig, cells, cvt, validity
 from cvtgs.cells import Moments
-from cvtgs.cvt import nearest_several
+from cvtgs.cvt.nearest import nearest_several
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.grouping import REASSIGN, allocation_at
 from cvtgs.math.segments import take_columns

@@ -17,7 +17,8 @@ import cvtgs
 from cvtgs.cli.main import main
 from cvtgs.devices import core_count
 from cvtgs.errors import InvalidSceneError, RunError
-from cvtgs.outofcore import LocalWorkers, simplify_file, worker_count
+from cvtgs.outofcore import LocalWorkers, simplify_file
+from cvtgs.outofcore.memory import worker_count
 from process_cases import die, numbered, refuse, wait
 
 pytestmark = pytest.mark.slow  # every process loads torch
@@ -166,7 +167,7 @@ def test_workers_of_the_command_share_the_memory(source, tmp_path, monkeypatch, 
         return true(*words, blocks=4, workers=workers, **more)
 
     monkeypatch.setattr(cvtgs.outofcore, "simplify_file", noting)
-    monkeypatch.setattr("cvtgs.outofcore.block_count", lambda source, memory, merging: 4)
+    monkeypatch.setattr("cvtgs.outofcore.memory.block_count", lambda source, memory, merging: 4)
     outputs = [tmp_path / "two.ply", tmp_path / "one.ply"]
     for output, count in zip(outputs, ("2", "1"), strict=True):
         words = ["simplify", str(source), str(output), "--rho", "0.05", "--memory", "6GB"]

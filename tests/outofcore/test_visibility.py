@@ -9,7 +9,7 @@ import torch
 import cvtgs
 from block_jobs import unfinished_job
 from cvtgs import Simplifier, SimplifyConfig
-from cvtgs.analysis import visibility_cameras
+from cvtgs.analysis.analyze import visibility_cameras
 from cvtgs.boxes import Box, inside
 from cvtgs.io.tensors import map_tensors
 from cvtgs.outofcore import simplify_file

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cvtgs.analysis import visibility_cameras
+from cvtgs.analysis.analyze import visibility_cameras
 from cvtgs.config import SimplifyConfig
 from cvtgs.progress import silent
 from cvtgs.refinement import RefineConfig, optimize

@@ -10,8 +10,9 @@ import cvtgs
 from cvtgs.config import Rates, SimplifyConfig
 from cvtgs.errors import DeviceError, InvalidArgumentError, InvalidSceneError
 from cvtgs.progress import ProgressEvent
-from cvtgs.refinement import RefineConfig, join_reports, refine
+from cvtgs.refinement import RefineConfig, refine
 from cvtgs.refinement.images import generated_views
+from cvtgs.refinement.refine import join_reports
 from refine_cases import discolored, full_scene, quick, ring, small_scene
 from scenes import same_bits
 

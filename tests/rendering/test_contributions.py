@@ -6,7 +6,8 @@ import torch
 import cvtgs
 from baseline_cases import gaussians
 from cvtgs import Simplifier, SimplifyConfig
-from cvtgs.analysis import analyze, measure_visibility
+from cvtgs.analysis import analyze
+from cvtgs.analysis.analyze import measure_visibility
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.rendering import blending_weights, contributions, observe, render

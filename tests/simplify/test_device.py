@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from cvtgs import Simplifier
-from cvtgs.cvt import nearest_neighbors, nearest_scipy, nearest_several
+from cvtgs.cvt import nearest_neighbors, nearest_scipy
+from cvtgs.cvt.nearest import nearest_several
 from cvtgs.devices import one_thread
 from cvtgs.errors import OutOfMemoryError
 from cvtgs.evaluation import psnr

@@ -26,7 +26,6 @@ from cvtgs.tradeoff import (
     Tradeoff,
     TradeoffResult,
     measure_tradeoff,
-    on_front,
     write_tradeoff,
 )
 from cvtgs.tradeoff.files import (
@@ -37,7 +36,7 @@ from cvtgs.tradeoff.files import (
     ticks,
     tradeoff_chart,
 )
-from cvtgs.tradeoff.results import with_fronts
+from cvtgs.tradeoff.results import on_front, with_fronts
 from cvtgs.tradeoff.runs import (
     WARNING,
     ProcessCost,

@@ -111,15 +111,7 @@ def analyze(
 
 
 def frame_of(means: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"]) -> RobustFrame:
-    """Return the robust frame of the Gaussians that are drawn at all; of all if none is.
-
-    Args:
-        means: Finite centres.
-        opacities: Their opacities.
-
-    Returns:
-        Centre and radius.
-    """
+    """Return the robust frame of the Gaussians that are drawn at all; of all if none is."""
     return robust_frame(means[drawn_rows(opacities)])
 
 
@@ -130,17 +122,7 @@ def apparent_areas(
     *,
     config: TessellationConfig,
 ) -> Float[Tensor, "n"]:
-    """Return areas as they count in images: smaller if far from the middle or enclosed.
-
-    Args:
-        areas: Mean projected areas.
-        distances: Distances to the centre of the scene, in robust radii.
-        visibility: Ambient visibility; ignored if ``config.hidden_share`` is 1.
-        config: Whether distance and enclosure count.
-
-    Returns:
-        Apparent areas, in the unit of ``areas``.
-    """
+    """Return areas as they count in images: smaller if far from the middle or enclosed."""
     apparent = areas
     if config.perspective:
         apparent = apparent * perspective_falloff(distances)
@@ -156,17 +138,7 @@ def measure_visibility(
     *,
     cameras: Cameras | None = None,
 ) -> SceneAnalysis:
-    """Correct apparent areas by the contributions of Gaussians to images of the scene.
-
-    Args:
-        scene: The Gaussians; all rows must be valid.
-        analysis: Their analysis.
-        config: The configuration; ``config.visibility`` sets the images and their weight.
-        cameras: Cameras to render from; None generates views.
-
-    Returns:
-        The analysis with corrected apparent areas, and the haze effect decided by them.
-    """
+    """Correct apparent areas, and the haze effect, by the contributions to images of the scene."""
     used, observed = drop_unused_bands(scene, analysis.plan), None
     views = visibility_cameras(used, config, cameras=cameras)
     if config.match.enabled:
@@ -194,14 +166,7 @@ def visibility_cameras(
 ) -> Cameras:
     """Return the cameras of the images that contributions are measured in.
 
-    Args:
-        scene: The Gaussians; all rows must be valid.
-        config: The configuration; ``config.visibility`` and the seed are used.
-        cameras: Cameras to choose from; None generates views.
-
-    Returns:
-        The cameras of images of every second, third, ... pixel, as the configuration says, in two
-        sizes; about every third one ignores the tag mip.
+    They have two sizes and every second, third, ... pixel; about a third ignore the tag mip.
     """
     choices = config.visibility
     least = SSIM_WINDOW * choices.stride
@@ -223,42 +188,14 @@ def measured_areas(
     mass_per_pixel: Float[Tensor, ""],
     share: float,
 ) -> Float[Tensor, "n"]:
-    """Return apparent areas that are corrected by the contributions to images.
-
-    Args:
-        areas: Apparent areas.
-        opacities: Opacities.
-        contributions: Contributions to images, pixels, float64.
-        mass_per_pixel: Area times opacity per pixel, summed over the whole scene.
-        share: Share of the given areas in the result, 0 to 1.
-
-    Returns:
-        Areas, in the type of ``areas``.
-    """
+    """Return apparent areas that are corrected by the contributions to images."""
     shown = (1.0 - share) * contributions * mass_per_pixel
     blended = share * (areas * opacities).double() + shown
     return divide(blended, opacities.double().clamp_min(MIN_OPACITY)).to(areas.dtype)
 
 
 def select_columns(scene: GaussianScene, choices: EffectsConfig) -> GaussianScene:
-    """Drop SH bands and extra columns that the configuration switches off.
-
-    Args:
-        scene: Any scene.
-        choices: Effects that are forced on or off.
-
-    Returns:
-        A scene of the same Gaussians with the SH bands and columns to use; the same object if
-        nothing is dropped.
-
-    Example:
-        >>> from cvtgs.synthetic import scene as make
-        >>> scene = make("object", 10, sh_degree=3, seed=0)
-        >>> select_columns(scene, EffectsConfig(sh=1)).sh_degree
-        1
-        >>> select_columns(scene, EffectsConfig()) is scene
-        True
-    """
+    """Drop SH bands and extra columns that the configuration switches off, if there are any."""
     if isinstance(choices.sh, int):
         scene = scene.with_sh_degree(choices.sh)
     if choices.extras == "off" and scene.extras:
@@ -267,7 +204,7 @@ def select_columns(scene: GaussianScene, choices: EffectsConfig) -> GaussianScen
 
 
 def drop_unused_bands(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
-    """Drop the SH bands that a scene does not call for, and the mip tag (:func:`drop_mip_tag`).
+    """Drop the SH bands that a scene does not call for, and a tag mip that is switched off.
 
     Args:
         scene: The scene that the plan was made for.
@@ -289,26 +226,7 @@ def drop_unused_bands(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
 
 
 def drop_mip_tag(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
-    """Remove the anti-aliasing tag of a scene, if it is to be rendered without anti-aliasing.
-
-    Args:
-        scene: Any scene.
-        plan: The effect plan; ``plan.mip`` decides.
-
-    Returns:
-        The scene; the same object if there is nothing to remove.
-
-    Example:
-        >>> from cvtgs.config import SimplifyConfig
-        >>> from cvtgs.analysis import plan_effects
-        >>> from cvtgs.synthetic import scene as make
-        >>> scene = make("object", 10, sh_degree=0, seed=0)
-        >>> scene = replace(scene, comments=("SplatRenderMode: mip",))
-        >>> config = SimplifyConfig(effects=EffectsConfig(mip="off"))
-        >>> plan = plan_effects(scene, scene.masses, distances=torch.ones(10), config=config)
-        >>> scene.antialiased, drop_mip_tag(scene, plan).antialiased
-        (True, False)
-    """
+    """Remove the anti-aliasing tag of a scene, if it is to be rendered without anti-aliasing."""
     if plan.mip.active or not scene.antialiased:
         return scene
     return replace(scene, comments=ANTIALIASED.removed_from(scene.comments))

@@ -172,18 +172,7 @@ def plan_effects(
 
 
 def drawn_rows(opacities: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
-    """Return which Gaussians images can show at all; all of them if none can be seen.
-
-    Args:
-        opacities: Opacities; renderers skip what is below 1/255.
-
-    Returns:
-        Mask of the rows.
-
-    Example:
-        >>> drawn_rows(torch.tensor([0.001, 0.5])).tolist()
-        [False, True]
-    """
+    """Return which Gaussians images can show at all; all of them if none can be seen."""
     drawn = opacities >= MIN_ALPHA
     return drawn | ~drawn.any()
 
@@ -191,30 +180,13 @@ def drawn_rows(opacities: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
 def haze_share(
     opacities: Float[Tensor, "n"], apparent_masses: Float[Tensor, "n"], config: SimplifyConfig
 ) -> Float[Tensor, ""]:
-    """Compute the share of the apparent mass that faint Gaussians hold, if they are drawn at all.
-
-    Args:
-        opacities: Opacities.
-        apparent_masses: Their opacities times apparent areas.
-        config: The configuration; ``filter.min_opacity`` is used.
-
-    Returns:
-        The share, 0 to 1.
-    """
+    """Compute the share of the apparent mass that faint Gaussians hold, of those that are drawn."""
     masses = apparent_masses.double() * drawn_rows(opacities)
     return divide((masses * (opacities < config.filter.min_opacity)).sum(), masses.sum())
 
 
 def plan_haze(share: float, config: SimplifyConfig) -> Effect:
-    """Decide whether faint Gaussians are haze, by their share of the apparent mass.
-
-    Args:
-        share: Result of :func:`haze_share`.
-        config: The configuration; ``effects.haze`` and ``filter`` are used.
-
-    Returns:
-        The effect.
-    """
+    """Decide whether faint Gaussians are haze, by their share of the apparent mass."""
     choice, most = config.effects.haze, config.filter.max_mass_share
     below = config.filter.min_opacity
     return Effect(
@@ -271,21 +243,6 @@ def band_losses(scene: GaussianScene, *, enough: float) -> tuple[float, ...]:
     by at most ``sqrt((2 l + 1) / (4 pi) sum c^2)``; here the sum is over all channels. This bound
     is divided by the opacity-weighted standard deviation of the constant colours, if that is below
     1.
-
-    Args:
-        scene: The Gaussians; all rows must be valid.
-        enough: The search ends when the highest band reaches this value, since all bands are
-            needed then; the figures are those of the Gaussians examined so far.
-
-    Returns:
-        One number for each degree above 0.
-
-    Example:
-        >>> from cvtgs.synthetic import scene as make
-        >>> scene = make("object", 100, sh_degree=1, seed=0)
-        >>> dull = scene.with_tensors({"shN": torch.zeros_like(scene.shN)}, {})
-        >>> band_losses(scene, enough=1e-4)[0] > 1e-4, band_losses(dull, enough=1e-4)
-        (True, (0.0,))
     """
     losses = [0.0] * scene.sh_degree
     if not losses:
@@ -313,19 +270,7 @@ def band_losses(scene: GaussianScene, *, enough: float) -> tuple[float, ...]:
 
 
 def far_share(distances: Float[Tensor, "n"], masses: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Return the share of the mass that is far away.
-
-    Args:
-        distances: Distances to the centre of the scene, in robust radii.
-        masses: Masses of the Gaussians.
-
-    Returns:
-        A number in [0, 1].
-
-    Example:
-        >>> float(far_share(torch.tensor([0.0, 9.0]), torch.tensor([1.0, 3.0])))
-        0.75
-    """
+    """Return the share of the mass that is far away."""
     return divide((masses * (distances > UNBOUNDED_DISTANCE)).sum(), masses.sum()).double()
 
 
@@ -334,17 +279,6 @@ def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) ->
 
     For large scenes it is estimated from a sample, which is chosen by a hash of the position, so
     that duplicates are sampled together. A crowd at one position counts wholly or not at all.
-
-    Args:
-        means: Positions.
-        sh0: Constant colours.
-
-    Returns:
-        A number in [0, 1).
-
-    Example:
-        >>> float(duplicate_share(torch.zeros(4, 3), torch.zeros(4, 1, 3)))
-        0.75
     """
     bits = max(0, math.floor(math.log2(max(1, len(means)) / HASHED)))
     rows, hashes = [], []

@@ -54,18 +54,7 @@ def ambient_visibility(
 
 
 def empty_depth_grid(device: torch.device) -> Int[Tensor, "voxels"]:
-    """Return an empty grid of optical depths, for :func:`add_depths`.
-
-    Args:
-        device: Device of the grid.
-
-    Returns:
-        Integer zeros: parts of a scene can be added in any order and give the same grid.
-
-    Example:
-        >>> int(empty_depth_grid(torch.device("cpu")).sum())
-        0
-    """
+    """Return an empty grid of optical depths: whole numbers, whose sums have no order."""
     return torch.zeros((2 * HALF_GRID) ** 3 + 1, dtype=torch.int64, device=device)
 
 
@@ -75,24 +64,7 @@ def add_depths(
     masses: Float[Tensor, "n"],
     frame: RobustFrame,
 ) -> Int[Tensor, "n"]:
-    """Add the optical depths of some Gaussians to a grid, in place.
-
-    Args:
-        sums: The grid.
-        means: Positions, scene units.
-        masses: Opacity times mean projected area, squared scene units.
-        frame: Centre and radius of the scene.
-
-    Returns:
-        The voxel of each Gaussian, int32.
-
-    Example:
-        >>> sums = empty_depth_grid(torch.device("cpu"))
-        >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
-        >>> place = add_depths(sums, torch.zeros(1, 3), torch.ones(1).double(), frame)
-        >>> visibility_grid(sums)[place.long()].tolist()
-        [1.0]
-    """
+    """Add the optical depths of some Gaussians to a grid, in place; return the voxel of each."""
     voxels = torch.empty(len(means), dtype=torch.int32, device=means.device)
     for part in row_chunks(len(means), CHUNK, means.device):
         voxel, shrinkage = _voxels_of(means[part], frame)
@@ -105,18 +77,7 @@ def add_depths(
 
 
 def visibility_grid(sums: Int[Tensor, "voxels"]) -> Float[Tensor, "voxels"]:
-    """Return the ambient visibility of every voxel of a finished grid.
-
-    Args:
-        sums: The grid that :func:`add_depths` filled.
-
-    Returns:
-        Numbers from 0 to 1 in float32; the last entry is 1, for everything beyond the grid.
-
-    Example:
-        >>> float(visibility_grid(empty_depth_grid(torch.device("cpu"))).amin())
-        1.0
-    """
+    """Return the ambient visibility of every voxel of a finished grid, and 1 for all beyond it."""
     size = 2 * HALF_GRID
     grid = (sums[:-1].to(torch.float32) / FIXED_POINT).reshape(size, size, size)
     visible = torch.zeros_like(grid)
@@ -133,22 +94,7 @@ def visibility_grid(sums: Int[Tensor, "voxels"]) -> Float[Tensor, "voxels"]:
 def visibility_at(
     grid: Float[Tensor, "voxels"], means: Float[Tensor, "n 3"], frame: RobustFrame
 ) -> Float[Tensor, "n"]:
-    """Look up the ambient visibility of Gaussians.
-
-    Args:
-        grid: The result of :func:`visibility_grid`.
-        means: Positions, scene units.
-        frame: Centre and radius of the scene.
-
-    Returns:
-        The same values as :func:`ambient_visibility` for the whole scene.
-
-    Example:
-        >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
-        >>> grid = visibility_grid(empty_depth_grid(torch.device("cpu")))
-        >>> visibility_at(grid, torch.zeros(1, 3), frame).tolist()
-        [1.0]
-    """
+    """Look up the ambient visibility of Gaussians in a :func:`visibility_grid`."""
     chunks = row_chunks(len(means), CHUNK, means.device)
     parts = [grid[_voxels_of(means[part], frame)[0]] for part in chunks]
     return torch.cat([grid[:0], *parts]).double()

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.analysis import far_share
+from cvtgs.analysis.effects import far_share
 from cvtgs.cells.moments import UPPER, Moments
 from cvtgs.config import AllocationConfig
 from cvtgs.devices import in_chunks

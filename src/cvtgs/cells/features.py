@@ -99,8 +99,7 @@ def describe_cells(
     share of the mass, and colour relative to the cell. Unlike there, orientation is given as
     extents along the axes of the cell (several quaternions describe the same one), colour as a
     distance only; cells also have features of their neighbours and of the sides that these cover,
-    and members their ambient visibility. Large cells are described by a sample of their members
-    (:func:`cvtgs.cells.sample_members`).
+    and members their ambient visibility. Large cells are described by a sample of their members.
 
     Memory: about ``1.5 kB`` per described member and per pair of a cell and a neighbour.
 

@@ -158,22 +158,9 @@ def inflate_cells(
 def side_cover(
     scene: GaussianScene, rows: Int[Tensor, "r"], neighbors: Int[Tensor, "r k"]
 ) -> Float[Tensor, "r 3 2"]:
-    """Return the opacity of neighbours at both ends of every axis.
+    """Return the opacity of neighbours three standard deviations along each axis, on either side.
 
-    Args:
-        scene: All Gaussians.
-        rows: The Gaussians whose axes are probed.
-        neighbors: Row numbers of the neighbours of each.
-
-    Returns:
-        Opacities in [0, 1) at three standard deviations along each axis, on either side, float64:
-        neighbours are composited, each with its opacity times its unnormalised density there.
-
-    Example:
-        >>> from cvtgs.synthetic import scene as make
-        >>> scene = make("object", 2, sh_degree=0, seed=0)
-        >>> side_cover(scene, torch.tensor([0]), torch.tensor([[1]])).shape
-        torch.Size([1, 3, 2])
+    Neighbours are composited, each with its opacity times its unnormalised density there.
     """
     others = neighbors.flatten()
     ids = torch.arange(len(rows), device=rows.device).repeat_interleave(neighbors.shape[1])

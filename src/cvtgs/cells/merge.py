@@ -156,15 +156,7 @@ class Members:
 
 
 def gather_members(scene: GaussianScene, part: Partition) -> Members:
-    """Gather the members of some cells, as needed for their moments.
-
-    Args:
-        scene: The Gaussians.
-        part: Row numbers of the cells.
-
-    Returns:
-        The members in float64.
-    """
+    """Gather the members of some cells, as needed for their moments."""
     rows = part.order
     means, quats, log_scales = gather_columns(rows, scene.means, scene.quats, scene.log_scales)
     log_scales = log_scales.double()
@@ -184,21 +176,7 @@ def gather_members(scene: GaussianScene, part: Partition) -> Members:
 def normalized_weights(
     weights: Float[Tensor, "n"], offsets: Int[Tensor, "m_plus_1"], cells: Int[Tensor, "n"]
 ) -> Float[Tensor, "n"]:
-    """Scale weights so that those of each cell sum to 1.
-
-    Args:
-        weights: Weights, at least 0; members of one cell are contiguous.
-        offsets: Start of each cell, and the end of the last one.
-        cells: Cell of every member.
-
-    Returns:
-        Weights in float64; equal ones in cells whose weights are all 0 or denormal.
-
-    Example:
-        >>> weights, cells = torch.tensor([1.0, 3.0]), torch.tensor([0, 0])
-        >>> normalized_weights(weights, torch.tensor([0, 2]), cells).tolist()
-        [0.25, 0.75]
-    """
+    """Scale weights so that those of each cell sum to 1."""
     weights = weights.double()
     totals = segment_sum(weights, offsets).index_select(0, cells)
     shares = weights / totals.clamp_min(torch.finfo(weights.dtype).tiny)
@@ -214,13 +192,6 @@ def mean_and_covariance(
     The covariance is the weighted mean of the members' covariances plus the weighted spread of
     their means; the spread is computed about the mean, in two passes, so that no digits are lost
     far from the origin.
-
-    Args:
-        members: Members of the cells.
-        weights: Weights that sum to 1 in each cell.
-
-    Returns:
-        Means and covariances of the cells, float64.
     """
     offsets, cells = members.offsets, members.cells
     first = members.means.index_select(0, offsets[:-1]).T.contiguous()
@@ -248,19 +219,12 @@ def merged_depth(
 ) -> Float[Tensor, "m"]:
     """Return the optical depth of the Gaussian that stands for a cell.
 
-    Args:
-        members: Members of the cells.
-        areas: Mean projected areas of the merged Gaussians.
-        rule: ``union``: all members lie behind one another, so depths add up (CVT-GS:
-            ``1 - prod(1 - a)``). ``saturating``: the contributions of members to an image add
-            up (:func:`cvtgs.math.depths.integrated_depth`), until the cell is opaque.
-        antialiased: Whether images are rendered with the compensation of Mip-Splatting. Then no
-            dilation closes the gaps between merged Gaussians, and ``saturating`` returns the
-            geometric mean of this depth and of the depth that conserves central depth times area.
-            That is deeper where opaque members lie side by side.
-
-    Returns:
-        Optical depths; the opacity is ``1 - exp(-depth)``.
+    By ``union``, all members lie behind one another, and depths add up (the paper has this rule).
+    By ``saturating``, the contributions of members to an image add up
+    (:func:`cvtgs.math.depths.integrated_depth`), until the cell is opaque. With the compensation of
+    Mip-Splatting, no dilation closes the gaps between merged Gaussians: then it is the geometric
+    mean of this depth and of the one that conserves central depth times area, which is deeper where
+    opaque members lie side by side.
     """
     if rule == "union":
         return segment_sum(members.depths, members.offsets)

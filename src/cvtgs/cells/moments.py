@@ -83,8 +83,8 @@ def gaussian_moments(
         masses: Mass of each.
         apparent_masses: Mass of each as seen in images.
         components: Result of :func:`view_components`; None for no view-dependent colour.
-        unit: Divisor of both masses; None divides each by its own
-            :func:`cvtgs.cells.mass_unit`.
+        unit: Divisor of both masses; None divides each by its mean, or
+            a million medians if that is less.
 
     Returns:
         The moments, in the order of the rows.
@@ -128,21 +128,7 @@ def gaussian_moments(
 
 
 def mass_unit(masses: Float[Tensor, "n"], mean: Tensor | float) -> Float[Tensor, ""]:
-    """Return the unit of masses: their mean, unless a few giants make it useless.
-
-    Args:
-        masses: Masses of all Gaussians, or of a sample.
-        mean: Mean mass of all Gaussians.
-
-    Returns:
-        The mean, but at most a million medians; float64.
-
-    Example:
-        >>> float(mass_unit(torch.tensor([1.0, 1.0, 7.0]), 3.0))
-        3.0
-        >>> float(mass_unit(torch.ones(3), 1e60))
-        1000000.0
-    """
+    """Return the unit of masses: their mean, but at most a million medians (a few giants)."""
     most = MOST_MEDIANS * masses.double().median()
     return torch.where(most > 0.0, most, torch.inf).clamp_max(mean)
 

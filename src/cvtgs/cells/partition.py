@@ -245,7 +245,6 @@ class SampledMembers(NamedTuple):
     rates: Float[Tensor, "n"]
 
 
-@checked
 def sample_members(scene: GaussianScene, part: Partition) -> SampledMembers:
     """Take all members of small cells, and of large cells some in proportion to their mass.
 
@@ -253,21 +252,6 @@ def sample_members(scene: GaussianScene, part: Partition) -> SampledMembers:
     equal steps. Members are in the order of a space-filling curve, so that the sample spreads over
     the cell. A sum over all members is estimated by sampled values divided by their rates (Horvitz
     and Thompson 1952). Masses are in float64, so that every dtype gives the same sample.
-
-    Args:
-        scene: The Gaussians.
-        part: Members of the cells, at least one of each.
-
-    Returns:
-        The sampled members, in the same order; at most ``MOST_SAMPLED`` of every cell.
-
-    Example:
-        >>> from cvtgs.synthetic import scene as make
-        >>> scene = make("object", 1000, sh_degree=0, seed=0)
-        >>> cells = Partition.from_labels(torch.tensor([0] * 990 + [1] * 10), 2)
-        >>> sampled = sample_members(scene, cells)
-        >>> sampled.part.counts.tolist(), sampled.counts.tolist()
-        ([32, 10], [990, 10])
     """
     counts, offsets, total = part.counts, part.offsets, len(part.order)
     on_host = part.order.device.type == "cpu"

@@ -36,8 +36,7 @@ def add_block_options(parser: argparse.ArgumentParser) -> None:
 
 def memory_of(options: argparse.Namespace) -> int:
     """Return the memory to use, in bytes; raise if the options of workers are invalid."""
-    from cvtgs.outofcore import available_memory, read_bytes
-    from cvtgs.outofcore.memory import memory_to_plan
+    from cvtgs.outofcore.memory import available_memory, memory_to_plan, read_bytes
 
     if options.workers is not None and (options.workers < 1 or options.scheduler is not None):
         raise InvalidArgumentError(
@@ -54,7 +53,8 @@ def block_workers(
     options: argparse.Namespace, memory: int
 ) -> Iterator[tuple["Workers | None", int]]:
     """Return workers, None for this process alone, and the bytes that each may use."""
-    from cvtgs.outofcore import ClusterWorkers, LocalWorkers, connect, worker_count
+    from cvtgs.outofcore import ClusterWorkers, LocalWorkers, connect
+    from cvtgs.outofcore.memory import worker_count
 
     with ExitStack() as stack:
         if options.scheduler is not None:

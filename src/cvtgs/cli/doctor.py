@@ -78,6 +78,7 @@ def doctor(options: argparse.Namespace) -> None:
     """Run ``cvtgs doctor``."""
     import torch
 
+    from cvtgs.cvt.nearest import search_name
     from cvtgs.devices import chosen_device, device_name
 
     say("\n".join(version_lines()))
@@ -90,7 +91,7 @@ def doctor(options: argparse.Namespace) -> None:
         for name in RENDERERS:
             use = " (used: the fastest that works here)" if name == taken else ""
             say(f"  images by {name:<7} {_renderer_state(name, one)}{use}")
-        say(f"  nearest sites by {SEARCHES[cvtgs.cvt.search_name(one)]}")
+        say(f"  nearest sites by {SEARCHES[search_name(one)]}")
     if options.device == "auto" and not gpus:
         say("\ncuda: not available")
     say(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one image")

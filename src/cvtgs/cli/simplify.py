@@ -278,7 +278,7 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
 
 def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int | None:
     """Return the bytes for simplifying in blocks; None if blocks are not needed or not possible."""
-    from cvtgs.outofcore import check_config
+    from cvtgs.outofcore.run import check_config
 
     memory = memory_of(options)
     names = ("target_psnr", "target_ssim", "time_budget")
@@ -303,7 +303,7 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
 def _needs_blocks(options: argparse.Namespace, memory: int, config: "SimplifyConfig") -> bool:
     """Return whether a file does not fit; only binary PLYs can be read in parts, and simplified."""
     from cvtgs.grouping import finer_count
-    from cvtgs.outofcore import block_count
+    from cvtgs.outofcore.memory import block_count
 
     rows = _rows_of(options.input)
     if rows is None:

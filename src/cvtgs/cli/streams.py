@@ -63,7 +63,7 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
 
 def check_stream_options(options: argparse.Namespace) -> None:
     """Check the options of streams before the long work starts."""
-    from cvtgs.streams import check_stream
+    from cvtgs.streams.files import check_stream
 
     if options.no_scores and (scoring := _of_scores(options)):
         raise InvalidArgumentError(f"--{scoring[0]} cannot be used with --no-scores.")
@@ -105,7 +105,8 @@ def _of_scores(options: argparse.Namespace) -> list[str]:
 
 def read_transform(options: argparse.Namespace) -> tuple[float, ...] | None:
     """Read ``--place`` or ``--transform``; return None if neither is given."""
-    from cvtgs.streams import check_transform, geo_transform
+    from cvtgs.streams import geo_transform
+    from cvtgs.streams.tiles import check_transform
 
     if options.place is None and options.transform is None:
         return None
@@ -144,7 +145,8 @@ def stream_blocks(
     from cvtgs.grouping import finer_count
     from cvtgs.io.axes import SCENE_AXES
     from cvtgs.io.ply import open_rows
-    from cvtgs.outofcore import block_count, check_config
+    from cvtgs.outofcore.memory import block_count
+    from cvtgs.outofcore.run import check_config
     from cvtgs.streams import stream_file
     from cvtgs.streams.plan import CHUNK_GAUSSIANS
 

@@ -207,9 +207,9 @@ class MergeConfig(Section):
         area_power: The weight of a member is its opacity times its mean projected area to this
             power: 0 gives the opacity alone, 1 the mass.
         opacity: ``saturating`` conserves the optical depth summed over an image, until the cell is
-            opaque, and adds more where opaque members lie side by side in scenes tagged mip
-            (:func:`cvtgs.cells.merged_depth`); ``union`` is the opacity of members that lie exactly
-            behind one another, ``1 - prod(1 - a)``.
+            opaque, and adds more where opaque members lie side by side in scenes tagged mip;
+            ``union`` is the opacity of members that lie exactly behind one another,
+            ``1 - prod(1 - a)``.
         representatives: Whether a cell whose members hardly touch keeps the member that shows most
             instead of their moments.
         align_axes: Whether axes of equal length turn towards the neighbours

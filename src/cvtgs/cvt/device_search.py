@@ -85,19 +85,6 @@ def nearest_in_tiles(
     Sites are chosen by distances in float32, relative to the middle of the tile, and by distances
     in float64 where those are too coarse. Where two sites are equally near but for a percent or
     less, either may be found.
-
-    Args:
-        points: Positions.
-        sites: Positions on the same device, at least ``count``.
-        count: Number of sites to find for every point.
-
-    Returns:
-        Rows of the sites, nearest first, and their squared distances in float64.
-
-    Example:
-        >>> rows, squared = nearest_in_tiles(torch.tensor([[0.9]]), torch.tensor([[0.0], [1.0]]))
-        >>> rows.tolist()
-        [[1]]
     """
     points, sites = points.double(), sites.double()
     found = torch.empty(len(points), count, dtype=torch.int64, device=points.device)

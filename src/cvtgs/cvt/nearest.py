@@ -196,26 +196,10 @@ def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m
     return rows.gather(1, others).to(sites.device)
 
 
-@checked
 def nearest_several(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
-    """Find the nearest sites of every point, on CUDA if they are there, else on the host.
-
-    Args:
-        points: The points.
-        sites: The sites, on the same device.
-        count: Number of sites to find, if there are as many.
-
-    Returns:
-        Rows of the sites, nearest first, and their distances.
-
-    Raises:
-        InvalidArgumentError: There is no site, shapes or ``count`` do not fit, or (on the host) a
-            coordinate is not finite.
-    """
-    _check_sites(sites)
-    check_whole(count, "count")
+    """Return the rows of the sites nearest to every point, nearest first, and their distances."""
     device = search_device(sites.device)
     apart = _apart(sites.detach().to(device))
     more = apart.shape[1] - points.shape[1]

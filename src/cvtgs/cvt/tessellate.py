@@ -110,36 +110,14 @@ def tessellate(
 
 
 def choose_search(*, has_duplicates: bool) -> NearestSite:
-    """Choose the nearest-site search.
-
-    Args:
-        has_duplicates: Whether many points coincide; each position is then searched once.
-
-    Returns:
-        The search.
-    """
+    """Choose the search; with many duplicates, each position is searched once."""
     return search_once_per_position(nearest_site) if has_duplicates else nearest_site
 
 
-@checked
 def sample_points(
     points: Float[Tensor, "n d"], weights: Float[Tensor, "n"], size: int
 ) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k"]]:
-    """Take a weighted sample that represents all points, or all if it saves less than half.
-
-    Args:
-        points: The points.
-        weights: Their weights.
-        size: Wanted number of points, raised to a minimum; 0 takes all.
-
-    Returns:
-        The points of the sample, and their weights.
-
-    Raises:
-        InvalidArgumentError: Shapes do not fit together, ``size`` is negative, or a weight is
-            negative or not finite.
-    """
-    check_whole(size, "size", least=0)
+    """Take a weighted sample that represents all points, or all if it saves less than half."""
     enough = max(size, MIN_SAMPLES)
     if size == 0 or enough >= len(points) // 2:
         return points, weights
@@ -265,45 +243,19 @@ def lloyd(
     return LloydResult(sites=sites, energies=tuple(energies))
 
 
-@checked
 def weighted_sums(
     points: Float[Tensor, "n d"], weights: Float[Tensor, "n"], labels: Int[Tensor, "n"], count: int
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m d"]]:
-    """Sum weights and weighted points per label, in float64.
-
-    Args:
-        points: The points.
-        weights: Their weights.
-        labels: Label of each point.
-        count: Number of labels.
-
-    Returns:
-        Sums of the weights, and of the points times their weights.
-
-    Raises:
-        InvalidArgumentError: Shapes do not fit together, or (on the host) a label is out of range.
-    """
-    check_whole(count, "count")
-    check_range(labels, count - 1, "labels")
+    """Sum weights and weighted points per label, in float64."""
     columns = [torch.ones_like(weights), *points.unbind(1)]
     sums = label_sums(columns, labels, count, weights.double())
     return sums[0], sums[1:].T
 
 
-@checked
 def centroids(
     totals: Float[Tensor, "m"], sums: Float[Tensor, "m d"], fallback: Float[Tensor, "m d"]
 ) -> Float[Tensor, "m d"]:
-    """Divide sums by total weights.
-
-    Args:
-        totals: Total weight of each label.
-        sums: Sums of weighted points (:func:`weighted_sums`).
-        fallback: Values of labels without weight.
-
-    Returns:
-        The centroid of each label.
-    """
+    """Divide sums by total weights; labels without weight take the fallback."""
     filled = totals > 0
     means = sums / totals.where(filled, 1.0)[:, None]
     return torch.where(filled[:, None], means, fallback)

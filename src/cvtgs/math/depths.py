@@ -18,16 +18,6 @@ def integrated_depth(depths: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     A Gaussian transmits ``1 - a g(x)`` of the light, with g = 1 at its centre. The integral of
     ``-log(1 - a g(x))``, divided by its projected area ``2 pi sigma_1 sigma_2``, is the dilogarithm
     ``Li2(a)``: it grows like a, and ends at ``pi^2 / 6``, however large the depth at the centre.
-
-    Args:
-        depths: Optical depths at the centre, ``-log(1 - a)``, above 0.
-
-    Returns:
-        ``Li2(1 - exp(-depth))``, in (0, 1.645).
-
-    Example:
-        >>> round(integrated_depth(torch.tensor([0.6931472])).item(), 4)
-        0.5822
     """
     others = -parameters.positive_log(parameters.opacity_from_optical_depth(depths))  # -log(a)
     small = torch.minimum(depths, others)
@@ -38,18 +28,7 @@ def integrated_depth(depths: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def depth_from_integrated(values: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Return the optical depth at the centre (inverse of :func:`integrated_depth`).
-
-    Args:
-        values: Integrated depths, at least 0; values above the maximum of a Gaussian are clamped.
-
-    Returns:
-        Optical depths in [0, 13.8].
-
-    Example:
-        >>> round(depth_from_integrated(torch.tensor([0.5822405])).item(), 4)
-        0.6931
-    """
+    """Return the optical depth at the centre, at most 13.8: the inverse of the above."""
     tiny = torch.finfo(values.dtype).tiny
     values = values.clamp_max(FULL_DEPTH)
     depths = torch.maximum(values, -parameters.positive_log(1 - values / FULL_DEPTH)).clamp(

@@ -18,17 +18,6 @@ def symmetric_eigen(
 
     That function fails on CUDA with some ten thousand matrices (torch 2.11 with cuSOLVER 12 asks
     for half a megabyte for each). There, Jacobi rotations (1846) diagonalise all matrices at once.
-
-    Args:
-        matrices: Symmetric matrices; the lower triangle is used.
-
-    Returns:
-        Eigenvalues, ascending, and orthonormal eigenvectors as columns.
-
-    Example:
-        >>> values, _ = symmetric_eigen(torch.diag(torch.tensor([1.0, 9.0, 4.0]))[None])
-        >>> values.tolist()
-        [[1.0, 4.0, 9.0]]
     """
     if matrices.device.type != "cuda":
         values, axes = torch.linalg.eigh(matrices)

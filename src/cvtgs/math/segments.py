@@ -15,20 +15,7 @@ _WEIGHTS_ONLY_FAIL = torch.torch_version.TorchVersion(torch.__version__) < "2.6"
 def sort_by_label(
     labels: Int[Tensor, "n"], count: int
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "m_plus_1"]]:
-    """Sort rows by label.
-
-    Args:
-        labels: Label of every row, 0 to ``count - 1``.
-        count: Number of labels.
-
-    Returns:
-        Row numbers, sorted by label in a stable way, and the start of each label.
-
-    Example:
-        >>> order, offsets = sort_by_label(torch.tensor([1, 0, 1]), 2)
-        >>> order.tolist(), offsets.tolist()
-        ([1, 0, 2], [0, 1, 3])
-    """
+    """Return the rows in the order of their labels, stably, and the start of each label."""
     ascending, order = torch.sort(labels.to(torch.int32), stable=True)
     starts = torch.arange(count + 1, dtype=torch.int32, device=labels.device)
     return order, torch.searchsorted(ascending, starts)
@@ -65,20 +52,7 @@ def ascending_rows(values: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
 def gather_columns(
     rows: Int[Tensor, "r"], *tables: Float[Tensor, "n c"]
 ) -> list[Float[Tensor, "r c"]]:
-    """Gather scattered rows of narrow tables.
-
-    Args:
-        rows: Row numbers.
-        tables: One or more tables of a few columns.
-
-    Returns:
-        The rows of every table. Each column is contiguous in memory, so that sums of products over
-        columns run at the speed of memory.
-
-    Example:
-        >>> gather_columns(torch.tensor([2, 0]), torch.eye(3))[0].tolist()
-        [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
-    """
+    """Gather scattered rows of narrow tables; columns become contiguous, which sums faster."""
     return [table.T.gather(1, rows.expand(table.shape[1], -1)).T for table in tables]
 
 
@@ -94,16 +68,6 @@ def running_sums(values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
 
     CUDA's own cumulative sums of floating-point numbers add in any order. Therefore, on devices
     other than CPUs, values are added to those 1, 2, 4, ... places later (Hillis and Steele 1986).
-
-    Args:
-        values: Numbers.
-
-    Returns:
-        One sum per value; the last is the total.
-
-    Example:
-        >>> running_sums(torch.tensor([1.0, 2.0, 4.0])).tolist()
-        [1.0, 3.0, 7.0]
     """
     if values.device.type == "cpu":
         return values.cumsum(0)
@@ -120,21 +84,9 @@ def label_sums(
     count: int,
     weights: Float[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "k m"]:
-    """Sum the rows of each label, in the order of the rows, in float64.
+    """Sum the rows of each label in their order, in float64: the same bits on every device.
 
-    Args:
-        columns: One tensor per column; each is summed before the next is requested, so they may
-            share memory.
-        labels: Label of every row, 0 to ``count - 1``.
-        count: Number of labels, m.
-        weights: Factors of the rows, float64.
-
-    Returns:
-        One row per column; a label without rows gives 0. Every device gives the same bits.
-
-    Example:
-        >>> label_sums([torch.tensor([1.0, 2.0, 4.0])], torch.tensor([1, 0, 1]), 2).tolist()
-        [[2.0, 5.0]]
+    Each column is summed before the next is requested, so they may share memory.
     """
     on_host = labels.device.type == "cpu"  # adds in order; CUDA would add in any order
     order, offsets = (labels, labels) if on_host else sort_by_label(labels, count)
@@ -152,21 +104,7 @@ def label_sums(
 def label_argmin(
     values: Float[Tensor, "n"], labels: Int[Tensor, "n"], count: int
 ) -> Int[Tensor, "m"]:
-    """Find the first row with the smallest value of each label.
-
-    Args:
-        values: One number per row, none of them NaN.
-        labels: Label of every row, 0 to ``count - 1``.
-        count: Number of labels, m.
-
-    Returns:
-        Row numbers; n for a label without rows.
-
-    Example:
-        >>> values, labels = torch.tensor([2.0, 1.0, 1.0]), torch.tensor([1, 1, 1])
-        >>> label_argmin(values, labels, 2).tolist()
-        [3, 1]
-    """
+    """Find the first row with the smallest value of each label; n for a label without rows."""
     least = values.new_full((count,), torch.inf).scatter_reduce(0, labels, values, "amin")
     rows = torch.arange(len(labels), device=labels.device)
     rows = torch.where(values == least.index_select(0, labels), rows, len(labels))
@@ -179,22 +117,10 @@ def segment_sum(
     offsets: Int[Tensor, "m_plus_1"],
     weights: Float[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "m *k"]:
-    """Sum the rows of each segment.
+    """Sum the rows of each segment; an empty one gives 0. Weights are constants to autograd.
 
     ``embedding_bag`` over consecutive rows is up to ten times as fast as ``torch.segment_reduce``
     in float32, and up to twenty times as slow in float64.
-
-    Args:
-        values: Rows; those of a segment are contiguous.
-        offsets: Start of each segment, and the end of the last one.
-        weights: Factors of the rows, of the dtype of the values; constants to autograd.
-
-    Returns:
-        One row per segment; an empty segment gives 0.
-
-    Example:
-        >>> segment_sum(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0, 2, 3])).tolist()
-        [3.0, 3.0]
     """
     count, shape = offsets.shape[0] - 1, values.shape[1:]
     if values.numel() == 0:
@@ -228,22 +154,7 @@ def segment_sum_of(
     offsets: Int[Tensor, "m_plus_1"],
     weights: Float[Tensor, "n"],
 ) -> Float[Tensor, "m *k"]:
-    """Sum weighted rows of a table for each segment, without copying the rows.
-
-    Args:
-        table: Table of rows; a constant to autograd.
-        rows: Rows to sum; those of a segment are contiguous.
-        offsets: Start of each segment in ``rows``, and the end of the last one.
-        weights: Weight of each entry of ``rows``.
-
-    Returns:
-        One row per segment; an empty segment gives 0. Differentiable in the weights.
-
-    Example:
-        >>> table, rows = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2, 2, 0])
-        >>> segment_sum_of(table, rows, torch.tensor([0, 2, 3]), torch.ones(3)).tolist()
-        [6.0, 1.0]
-    """
+    """Sum weighted rows of a table for each segment, without copying them or a gradient of them."""
     flat = table.detach().reshape(table.shape[0], math.prod(table.shape[1:]))
     if weights.requires_grad and _WEIGHTS_ONLY_FAIL:
         flat.requires_grad_()
@@ -256,57 +167,21 @@ def segment_sum_of(
 def segment_max(
     values: Float[Tensor, "n *k"], offsets: Int[Tensor, "m_plus_1"]
 ) -> Float[Tensor, "m *k"]:
-    """Return the elementwise maximum of the rows of each segment.
-
-    Args:
-        values: Rows; those of a segment are contiguous.
-        offsets: Start of each segment, and the end of the last one.
-
-    Returns:
-        One row per segment; an empty segment gives minus infinity.
-
-    Example:
-        >>> segment_max(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0, 2, 3])).tolist()
-        [2.0, 3.0]
-    """
+    """Return the elementwise maximum of the rows of each segment; minus infinity without rows."""
     ids = segment_ids(offsets, len(values)).reshape(-1, *[1] * (values.ndim - 1)).expand_as(values)
     lowest = values.new_full((len(offsets) - 1, *values.shape[1:]), -torch.inf)
     return lowest.scatter_reduce(0, ids, values, "amax")
 
 
 def segment_ids(offsets: Int[Tensor, "m_plus_1"], total: int | None = None) -> Int[Tensor, "n"]:
-    """Return the segment of every row.
-
-    Args:
-        offsets: Start of each segment, and the end of the last one.
-        total: Number of rows; None reads it from the offsets, which synchronises with the device.
-
-    Returns:
-        Segment numbers, ascending.
-
-    Example:
-        >>> segment_ids(torch.tensor([0, 2, 3])).tolist()
-        [0, 0, 1]
-    """
+    """Return the segment of every row; without ``total``, the number of rows, the device waits."""
     return torch.repeat_interleave(offsets.diff(), output_size=total)
 
 
 def segment_argmax(
     values: Float[Tensor, "n"], offsets: Int[Tensor, "m_plus_1"]
 ) -> Int[Tensor, "m"]:
-    """Find the first row with the largest value of each segment.
-
-    Args:
-        values: One number per row, none of them NaN.
-        offsets: Start of each segment, and the end of the last one; no segment is empty.
-
-    Returns:
-        Row numbers.
-
-    Example:
-        >>> segment_argmax(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0, 2, 3])).tolist()
-        [1, 2]
-    """
+    """Find the first row with the largest value of each segment, none of them empty."""
     return label_argmin(-values, segment_ids(offsets, len(values)), len(offsets) - 1)
 
 

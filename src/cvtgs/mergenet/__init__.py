@@ -1,12 +1,11 @@
 """MergeNet: learned corrections of merged Gaussians, predicted from descriptors alone."""
 
-from cvtgs.mergenet.apply import compose, compose_published, correct_cells
+from cvtgs.mergenet.apply import compose, correct_cells
 from cvtgs.mergenet.checkpoint import (
     SHIPPED,
     Checkpoint,
     CheckpointInfo,
     LearnedScene,
-    build_network,
     load_checkpoint,
     save_checkpoint,
 )
@@ -24,7 +23,6 @@ from cvtgs.mergenet.published import (
     PublishedDescriptors,
     PublishedMergeNet,
     PublishedResiduals,
-    describe_published,
 )
 
 __all__ = [
@@ -42,11 +40,8 @@ __all__ = [
     "PublishedMergeNet",
     "PublishedResiduals",
     "Residuals",
-    "build_network",
     "compose",
-    "compose_published",
     "correct_cells",
-    "describe_published",
     "load_checkpoint",
     "save_checkpoint",
     "summarize",

@@ -240,25 +240,6 @@ def compose_published(
 
     Like :func:`compose`, but residuals are added to the SH coefficients of every band. Zero
     residuals return the merged Gaussians bit for bit. Differentiable in the residuals.
-
-    Args:
-        merged: One Gaussian per cell, for all cells.
-        cells: Row numbers of the cells to correct.
-        residuals: Changes of these cells.
-
-    Returns:
-        The standard tensors of these cells, by name.
-
-    Example:
-        >>> from cvtgs.synthetic import scene as make
-        >>> merged, none = make("object", 1, sh_degree=0, seed=0), torch.zeros(1, 3)
-        >>> residuals = PublishedResiduals(
-        ...     d_means=none, d_log_scales=none + 0.5, d_rotvecs=none, d_logit_opacities=none[:, 0],
-        ...     d_sh=torch.ones(1, 16, 3),
-        ... )
-        >>> tensors = compose_published(merged, cells=torch.tensor([0]), residuals=residuals)
-        >>> bool((tensors["sh0"] == merged.sh0 + 1).all()), tuple(tensors["shN"].shape)
-        (True, (1, 0, 3))
     """
     rest = merged.shN.shape[1]
     bands = {

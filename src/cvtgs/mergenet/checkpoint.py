@@ -245,12 +245,7 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
 
 
 def build_network(architecture: Architecture | PublishedArchitecture) -> Net:
-    """Build an untrained network in float32 on the CPU, which changes nothing.
-
-    Example:
-        >>> type(build_network(Architecture())).__name__
-        'MergeNet'
-    """
+    """Build an untrained network in float32 on the CPU, which changes nothing."""
     with torch.device("cpu"):  # the program may have other defaults
         if isinstance(architecture, PublishedArchitecture):
             return PublishedMergeNet(architecture).float()

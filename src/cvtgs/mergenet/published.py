@@ -87,25 +87,6 @@ def describe_published(
     """Compute the descriptors of some cells as CVT-GS does.
 
     Memory: about ``1 kB`` per member.
-
-    Args:
-        scene: The Gaussians.
-        merged: One Gaussian per cell, for all cells.
-        part: Members of the cells to describe.
-        cells: Row numbers of these cells in ``merged``.
-
-    Returns:
-        The descriptors, in the dtype of the scene.
-
-    Example:
-        >>> from cvtgs.synthetic import scene as make
-        >>> scene = make("object", 2, sh_degree=0, seed=0)
-        >>> part = Partition.from_labels(torch.tensor([0, 0]), 1)
-        >>> found = describe_published(
-        ...     scene, scene.select(torch.tensor([0])), part, cells=torch.tensor([0])
-        ... )
-        >>> tuple(found.members.shape), found.members[0, :7].round(decimals=3).tolist()
-        ((2, 60), [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     """
     rows, ids = part.order, segment_ids(part.offsets, len(part.order))
     own = cells.index_select(0, ids)

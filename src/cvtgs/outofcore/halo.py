@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cvt import NearestSite, nearest_several
+from cvtgs.cvt import NearestSite
+from cvtgs.cvt.nearest import nearest_several
 from cvtgs.outofcore.job import Job, Step
 
 RUN = 1 << 9

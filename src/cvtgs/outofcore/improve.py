@@ -13,12 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.analysis import (
-    drop_unused_bands,
-    restore_columns,
-    select_columns,
-    visibility_cameras,
-)
+from cvtgs.analysis import drop_unused_bands, restore_columns
+from cvtgs.analysis.analyze import select_columns, visibility_cameras
 from cvtgs.cameras import Cameras
 from cvtgs.devices import one_thread
 from cvtgs.io import load

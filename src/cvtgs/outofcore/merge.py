@@ -8,8 +8,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs import cells, cvt, validity
-from cvtgs.analysis import drop_unused_bands, restore_columns, select_columns
+from cvtgs.analysis import drop_unused_bands, restore_columns
+from cvtgs.analysis.analyze import select_columns
 from cvtgs.clock import StageClock
+from cvtgs.cvt.nearest import search_name
 from cvtgs.devices import one_thread
 from cvtgs.io import atomic_output, save
 from cvtgs.io.axes import SCENE_AXES
@@ -131,7 +133,7 @@ def correct(job: Job, block: int) -> None:
         mass_out=float(small.masses.sum()),
         single_member_cells=shown.count_singles(),
         largest_cell=int(partition.counts.amax()),
-        backend=cvt.search_name(scene.device),
+        backend=search_name(scene.device),
     )
     write_block(job, block, small, report)
 

@@ -8,7 +8,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from cvtgs.analysis import restore_columns, select_columns
+from cvtgs.analysis import restore_columns
+from cvtgs.analysis.analyze import select_columns
 from cvtgs.boxes import Box
 from cvtgs.cameras import Cameras
 from cvtgs.clock import StageClock
@@ -110,7 +111,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         The report, with cell statistics of all blocks and wall-clock seconds of all stages.
 
     Raises:
-        ConfigError: The configuration cannot be used with blocks (:func:`check_config`).
+        ConfigError: The configuration cannot be used with blocks.
         InvalidArgumentError: Ratio, count or boxes cannot be met.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
@@ -192,13 +193,8 @@ def rows_per_range(count: int) -> int:
 def check_config(config: SimplifyConfig, *, with_images: bool = True) -> None:
     """Raise if a configuration cannot be applied block by block.
 
-    Args:
-        config: The configuration.
-        with_images: Whether blocks may be matched to images of the scene or refined.
-
-    Raises:
-        ConfigError: The configuration uses images of the scene where it may not, or refines for a
-            time in seconds, which would give different bits in every run.
+    That is one with images where there are none, or with a refinement for a time in seconds, which
+    would give different bits in every run.
     """
     if not with_images and config.uses_images:
         raise ConfigError(

@@ -16,7 +16,10 @@ from torch import Tensor
 
 from cvtgs import analysis, cells, cvt, filters, validity
 from cvtgs.analysis import EffectPlan, SceneAnalysis
+from cvtgs.analysis.analyze import apparent_areas, select_columns
+from cvtgs.analysis.visibility import add_depths, empty_depth_grid, visibility_at, visibility_grid
 from cvtgs.boxes import Box, inside
+from cvtgs.cells.moments import mass_unit
 from cvtgs.config import SimplifyConfig
 from cvtgs.devices import HOST, one_thread
 from cvtgs.grouping import curve_order
@@ -130,7 +133,7 @@ class RangeTotals(NamedTuple):
     """Sums over the valid rows of a range.
 
     Attributes:
-        depths: Grid of optical depths (:func:`cvtgs.analysis.add_depths`).
+        depths: Grid of optical depths (:func:`cvtgs.analysis.visibility.add_depths`).
         masses: ``(c,)`` sum of opacity times mean projected area over each chunk of rows, squared
             scene units; added in order, they give the same bits for any division into ranges.
         falloff_masses: ``(c,)`` the same sums with masses times the perspective falloff.
@@ -166,7 +169,7 @@ class SceneScan:
     Attributes:
         frame: Robust centre and radius.
         plan: The effects that the scene needs.
-        visibility: Grid of ambient visibility (:func:`cvtgs.analysis.visibility_grid`).
+        visibility: Grid of ambient visibility (:func:`cvtgs.analysis.visibility.visibility_grid`).
         min_opacity: The filter leaves out Gaussians of lower opacity.
         max_flyaway_mass: The filter leaves out flyaways whose mass, times the perspective falloff,
             is at most this; -1 leaves out none.
@@ -176,7 +179,7 @@ class SceneScan:
         view_components: Components of the view-dependent colour
             (:func:`cvtgs.cells.view_components`).
         mass: Opacity times mean projected area of all valid Gaussians, squared scene units.
-        mass_unit: Unit of the masses in moments (:func:`cvtgs.cells.mass_unit`).
+        mass_unit: Unit of the masses in moments (:func:`cvtgs.cells.moments.mass_unit`).
         invalid_rows: Rows that are dropped, by the attribute that is NaN, infinite or zero.
         row_count: Number of valid Gaussians outside boxes.
         kept_count: Number of valid Gaussians in boxes.
@@ -212,7 +215,7 @@ def scan_range(
     source: PlyRows, frame: RobustFrame, boxes: tuple[Box, ...], rows: RowRange
 ) -> RangeTotals:
     """Sum optical depths, masses and counts over a range of the source."""
-    depths = analysis.empty_depth_grid(HOST)
+    depths = empty_depth_grid(HOST)
     all_masses, falloff_masses, valid_count, kept_count = list[float](), list[float](), 0, 0
     far_masses, found = [torch.zeros(0, dtype=torch.float64)], Counter[str]()
     for start in range(rows.start, rows.stop, CHUNK):
@@ -222,7 +225,7 @@ def scan_range(
             found.update({name: int(mask.sum()) for name, mask in invalid.items()})
             scene = scene.select(~validity.any_row(scene, invalid))
         masses = scene.masses
-        analysis.add_depths(depths, scene.means, masses, frame)
+        add_depths(depths, scene.means, masses, frame)
         distances = frame.distances(scene.means)
         seen = masses * analysis.perspective_falloff(distances)
         far_masses.append(seen[distances > filters.FLYAWAY_RADII])
@@ -275,12 +278,12 @@ def scan_scene(
     measure of a block is the mean of its shares of the Gaussians and of their weight, so that no
     block has more than about twice the average of either.
     """
-    grid = analysis.visibility_grid(totals.depths)
-    sample = analysis.select_columns(sample, config.effects)
+    grid = visibility_grid(totals.depths)
+    sample = select_columns(sample, config.effects)
     known = analysis.analyze(sample, config)
-    visibility = analysis.visibility_at(grid, sample.means, frame)
+    visibility = visibility_at(grid, sample.means, frame)
     distances = frame.distances(sample.means)
-    apparent = analysis.apparent_areas(known.areas, distances, visibility, config=config.cvt)
+    apparent = apparent_areas(known.areas, distances, visibility, config=config.cvt)
     known = replace(known, apparent_areas=apparent, visibility=visibility)
     free = (~inside(boxes, sample.means)).nonzero()[:, 0]
     if boxes and len(free):
@@ -308,7 +311,7 @@ def scan_scene(
         partition=partition_space(frame.contract(sample.means[rows]), measure, blocks),
         view_components=_view_components(sample, known, rows, config),
         mass=totals.mass,
-        mass_unit=float(cells.mass_unit(known.areas * known.opacities, mean_mass)),
+        mass_unit=float(mass_unit(known.areas * known.opacities, mean_mass)),
         invalid_rows=totals.invalid_rows,
         row_count=row_count,
         kept_count=totals.kept_count,

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs import analysis, cvt, filters, validity
-from cvtgs.analysis import frame_of
+from cvtgs.analysis.analyze import apparent_areas, frame_of
+from cvtgs.analysis.visibility import visibility_at
 from cvtgs.boxes import check_room, inside
 from cvtgs.clock import StageClock
 from cvtgs.config import TessellationConfig
@@ -231,9 +232,9 @@ def _filtered(
     """Return the rows that pass the filter, their apparent areas and their visibility."""
     means, opacities = scene.means[rows], scene.opacities[rows]
     areas = scene.select(rows).areas
-    visibility = analysis.visibility_at(scan.visibility, means, scan.frame)
+    visibility = visibility_at(scan.visibility, means, scan.frame)
     distances = scan.frame.distances(means)
-    apparent = analysis.apparent_areas(areas, distances, visibility, config=config)
+    apparent = apparent_areas(areas, distances, visibility, config=config)
     stays = opacities >= scan.min_opacity
     if scan.max_flyaway_mass >= 0.0:
         far = distances > filters.FLYAWAY_RADII

@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from cvtgs.analysis import drop_mip_tag, measured_areas, visibility_cameras
+from cvtgs.analysis.analyze import drop_mip_tag, measured_areas, visibility_cameras
 from cvtgs.boxes import inside
 from cvtgs.cameras import Cameras
 from cvtgs.devices import one_thread

@@ -171,15 +171,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
 
 
 def join_reports(report: SimplifyReport, refined: Refined) -> SimplifyReport:
-    """Add a refinement to the report of the simplification before it.
-
-    Args:
-        report: The report of the simplification.
-        refined: The refinement.
-
-    Returns:
-        The report with the stage ``refine``, the gain, and the mass of the refined scene.
-    """
+    """Add a refinement to the report of the simplification before it."""
     return report.model_copy(
         update={
             "stages": (*report.stages, refined.report.cost),

@@ -13,7 +13,8 @@ from typing import NamedTuple
 from jaxtyping import Int
 from torch import Tensor
 
-from cvtgs.analysis import SceneAnalysis, select_columns
+from cvtgs.analysis import SceneAnalysis
+from cvtgs.analysis.analyze import select_columns
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, target_count
@@ -25,12 +26,12 @@ from cvtgs.io.atomic import make_folder
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
-from cvtgs.mergenet import Net
-from cvtgs.outofcore import Workers, available_memory, block_count, check_config
+from cvtgs.mergenet.published import Net
+from cvtgs.outofcore import Workers
 from cvtgs.outofcore.job import Job, job_folder, started
-from cvtgs.outofcore.memory import memory_to_plan, sample_rows
+from cvtgs.outofcore.memory import available_memory, block_count, memory_to_plan, sample_rows
 from cvtgs.outofcore.rows import analysis_of, read_rows
-from cvtgs.outofcore.run import rows_per_range
+from cvtgs.outofcore.run import check_config, rows_per_range
 from cvtgs.outofcore.sort import sort_into_blocks
 from cvtgs.pipeline import level_facts, reduce_scene
 from cvtgs.processes import with_progress

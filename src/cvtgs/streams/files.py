@@ -175,24 +175,7 @@ def join_trees(
 
 
 def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool = False) -> None:
-    """Check that a stream can be written, before the long work starts.
-
-    Args:
-        folder: Folder to write to; created if it is missing.
-        kind: ``sog`` or ``3dtiles``.
-        overwrite: Whether files of an earlier stream may be replaced.
-
-    Raises:
-        InvalidArgumentError: There is no such kind of stream.
-        OutputExistsError: The folder holds a stream that may not be replaced, or other files but
-            no stream of this kind.
-        OutputError: The folder cannot be written to.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as parent:
-        ...     check_stream(Path(parent) / "new", "sog")
-    """
+    """Check that a stream can be written, before the long work starts."""
     if kind not in INDEX_NAMES:
         names = " or ".join(INDEX_NAMES)
         raise InvalidArgumentError(f"kind of a stream must be {names}, found {kind!r}.")

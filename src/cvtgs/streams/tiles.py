@@ -200,17 +200,7 @@ def geo_transform(longitude: float, latitude: float, height: float = 0.0) -> tup
 
 
 def check_transform(numbers: Sequence[float]) -> tuple[float, ...]:
-    """Check the transform of a tileset.
-
-    Args:
-        numbers: 16 numbers, column by column.
-
-    Returns:
-        The same numbers.
-
-    Raises:
-        InvalidArgumentError: The transform is not affine and invertible.
-    """
+    """Return the transform of a tileset, 16 numbers by columns; raise unless it is invertible."""
     values = tuple(map(float, numbers))
     is_matrix = len(values) == 16 and all(map(math.isfinite, values))
     last = values[3::4]

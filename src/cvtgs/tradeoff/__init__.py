@@ -2,7 +2,7 @@
 
 from cvtgs.tradeoff.files import write_tradeoff
 from cvtgs.tradeoff.measure import Measured, measure_tradeoff
-from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult, on_front
+from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult
 
 __all__ = [
     "Failure",
@@ -10,6 +10,5 @@ __all__ = [
     "Tradeoff",
     "TradeoffResult",
     "measure_tradeoff",
-    "on_front",
     "write_tradeoff",
 ]

@@ -163,17 +163,6 @@ def on_front(costs: Sequence[float], gains: Sequence[float]) -> tuple[bool, ...]
     """Return which of several choices are on the Pareto front: those that no other beats.
 
     One beats another if it costs no more and gains no less, and is better in one of the two.
-
-    Args:
-        costs: Less is better.
-        gains: One per cost; more is better, and NaN is never on the front.
-
-    Returns:
-        Whether each choice is on the front.
-
-    Example:
-        >>> on_front([1.0, 2.0, 3.0], [20.0, 19.0, 25.0])
-        (True, False, True)
     """
     pairs = list(zip(costs, gains, strict=True))
     return tuple(

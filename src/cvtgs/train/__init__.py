@@ -2,7 +2,7 @@
 
 from cvtgs.train.config import DataConfig, LossConfig, TrainConfig, ViewsConfig
 from cvtgs.train.loop import TrainFiles, train
-from cvtgs.train.sources import Source, find_sources
+from cvtgs.train.sources import Source
 from cvtgs.train.state import Gain, History, Validation
 
 __all__ = [
@@ -15,6 +15,5 @@ __all__ = [
     "TrainFiles",
     "Validation",
     "ViewsConfig",
-    "find_sources",
     "train",
 ]

@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.analysis import analyze, drop_unused_bands, measure_visibility
+from cvtgs.analysis import analyze, drop_unused_bands
+from cvtgs.analysis.analyze import measure_visibility
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Descriptors, Partition, describe_cells
 from cvtgs.config import SimplifyConfig
@@ -18,7 +19,9 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.filters import filter_rows
 from cvtgs.grouping import allocate, collect_cells, tessellate_rows, weigh_rows
 from cvtgs.io import load_cameras
-from cvtgs.mergenet import MergeNet, Net, Residuals, compose, compose_published, describe_published
+from cvtgs.mergenet import MergeNet, Residuals, compose
+from cvtgs.mergenet.apply import compose_published
+from cvtgs.mergenet.published import Net, describe_published
 from cvtgs.pipeline import merge_and_inflate
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene

@@ -23,11 +23,11 @@ from cvtgs.mergenet import (
     CheckpointInfo,
     Net,
     PublishedArchitecture,
-    build_network,
     load_checkpoint,
     save_checkpoint,
     summarize,
 )
+from cvtgs.mergenet.checkpoint import build_network
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.train.cache import TrainingScene, prepare_scene
 from cvtgs.train.cases import Case, DeviceCopies, TargetViews

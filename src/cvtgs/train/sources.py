@@ -49,27 +49,7 @@ class Source:
 
 
 def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
-    """List the scenes of a training without making them.
-
-    Args:
-        config: Settings of the scenes.
-        seed: Seed of pieces, copies and generated scenes.
-
-    Returns:
-        Sources with unique names: those of files, folder by folder in alphabetical order, then
-        generated ones.
-
-    Raises:
-        ConfigError: A folder or a validation file is missing, or there is nothing to train on
-            or to validate with.
-        FileFormatError: A file is not a PLY file with Gaussians, or is damaged.
-
-    Example:
-        >>> config = DataConfig(generated=1, generated_validation=1, generated_counts=(1000,))
-        >>> sources = find_sources(config, seed=0)
-        >>> sources[0].name, sources[0].make()
-        ('generated-object-0', GaussianScene(1,000 Gaussians, SH degree 0, float32, cpu))
-    """
+    """List the scenes of a training without making them: files by name, then generated ones."""
     files = [path for folder in config.folders for path in _files_in(folder)]
     names = [path.stem for path in files]
     held_out = set(config.validation) or set(names[1::5])
