@@ -20,7 +20,7 @@ from cvtgs.io.ply import open_rows
 from cvtgs.math.frames import robust_frame
 from cvtgs.outofcore import allocate, simplify_file
 from cvtgs.outofcore import scan as scan_module
-from cvtgs.outofcore.memory import block_count, needed_memory, read_bytes
+from cvtgs.outofcore.memory import SMALL_BASE_BYTES, block_count, needed_memory, read_bytes
 from cvtgs.outofcore.scan import (
     RangeTotals,
     RowRange,
@@ -305,7 +305,7 @@ def test_other_presets_work_in_blocks(source, tmp_path, preset):
 
 
 @pytest.mark.parametrize(
-    ("text", "wanted"), [("4GB", 4 * 10**9), ("2 GiB", 2**31), ("500mb", 5 * 10**8)]
+    ("text", "wanted"), [("4GB", 4 * 10**9), ("2 GiB", 2**31), ("600mb", 6 * 10**8)]
 )
 def test_amounts_of_memory_are_parsed(text, wanted):
     assert read_bytes(text) == wanted
@@ -342,7 +342,8 @@ def test_a_block_of_twice_the_mean_size_fits_into_memory(memory):
 def test_less_memory_makes_more_blocks(source):
     rows = open_rows(source)
     assert block_count(rows, 10**10) == 1
-    assert block_count(rows, 350_100_000) > block_count(rows, 350_500_000) > 1
+    few, more = (block_count(rows, SMALL_BASE_BYTES + rest) for rest in (500_000, 100_000))
+    assert more > few > 1
 
 
 @pytest.mark.slow

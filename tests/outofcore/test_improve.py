@@ -10,6 +10,7 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.outofcore import LocalWorkers, simplify_file
 from cvtgs.outofcore import improve as module
+from cvtgs.outofcore.memory import IMAGE_BYTES, LEAST_BYTES
 from cvtgs.report import MatchReport
 from cvtgs.views import automatic_views
 
@@ -129,8 +130,9 @@ def test_reports_of_matched_blocks_are_joined():
 
 
 def test_images_raise_the_least_memory(source, tmp_path):
-    with pytest.raises(InvalidArgumentError, match="at least 800,000,000 with images"):
-        in_blocks(source, tmp_path / "no.ply", MATCHED, blocks=None, memory=600_000_000)
+    least = LEAST_BYTES + IMAGE_BYTES
+    with pytest.raises(InvalidArgumentError, match=f"at least {least:,} with images"):
+        in_blocks(source, tmp_path / "no.ply", MATCHED, blocks=None, memory=least - 1)
 
 
 @pytest.mark.long

@@ -29,6 +29,9 @@ from cvtgs.outofcore.memory import (
     sample_rows,
 )
 
+MORE = LIBRARY_BYTES - 280_000_000
+"""Bytes that this build of torch takes more than that for CPUs."""
+
 
 def machine(root: Path, groups: str, files: dict[str, str]) -> Path:
     """Write the system files of a machine under another root."""
@@ -146,7 +149,7 @@ def test_the_least_memory_is_accepted_and_less_is_refused() -> None:
         read_bytes(f"{least - 1}MB")
 
 
-@pytest.mark.parametrize(("build", "least"), [(None, 400), ("13.0", 670)])
+@pytest.mark.parametrize(("build", "least"), [(None, 400), ("13.0", 550)])
 def test_the_build_of_torch_counts(build: str | None, least: int) -> None:
     program = (
         f"import torch\ntorch.version.cuda = {build!r}\n"
@@ -203,22 +206,24 @@ def test_a_job_under_a_ulimit_uses_blocks_without_an_option(tmp_path: Path) -> N
 def test_pairs_that_merge_need_memory() -> None:
     rows = SimpleNamespace(count=2_000_000, dtype=np.dtype([("x", "u1", 68)]))
     few, all_rows = (needed_memory(rows, rows.count, merging=n) for n in (160_000, rows.count))
-    assert 1_134e6 < few < 1.35 * 1_134e6  # what was measured at 0.01
-    assert 1_676e6 < all_rows < 1.2 * 1_676e6  # and at 0.1
-    assert block_count(rows, 1_500_000_000, merging=160_000) == 1
-    assert block_count(rows, 1_500_000_000, merging=rows.count) > 1
+    assert 1_134e6 < few - MORE < 1.35 * 1_134e6  # what was measured at 0.01
+    assert 1_676e6 < all_rows - MORE < 1.2 * 1_676e6  # and at 0.1
+    assert block_count(rows, 1_500_000_000 + MORE, merging=160_000) == 1
+    assert block_count(rows, 1_500_000_000 + MORE, merging=rows.count) > 1
 
 
 def test_cells_that_merge_together_do_not_depend_on_every_byte() -> None:
-    rooms = {cell_room(2_100_000_000 + k * 1_000_000) for k in range(100)}
+    rooms = {cell_room(2_100_000_000 + MORE + k * 1_000_000) for k in range(100)}
     assert rooms == {cell_room(None)} == {1 << 20}
-    assert cell_room(8_000_000_000) == 4 << 20
-    assert cell_room(2_000_000_000) == 7 << 17
+    assert cell_room(8_000_000_000 + MORE) == 4 << 20
+    assert cell_room(2_000_000_000 + MORE) == 7 << 17
     assert cell_room(LEAST_BYTES) == cell_room(LEAST_BYTES + 10) > 0
 
 
 def test_blocks_need_the_least_memory(tmp_path: Path) -> None:
     cvtgs.save(cvtgs.synthetic.scene("object", 200, sh_degree=0), tmp_path / "a.ply")
     for wrong in (100_000_000, 5e8, "1GB"):
-        with pytest.raises(InvalidArgumentError, match="number of bytes, at least 400,000,000; f"):
+        with pytest.raises(
+            InvalidArgumentError, match=f"number of bytes, at least {LEAST_BYTES:,}; f"
+        ):
             simplify_file(tmp_path / "a.ply", tmp_path / "b.ply", 0.1, memory=wrong, blocks=2)
