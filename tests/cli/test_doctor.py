@@ -68,7 +68,7 @@ def test_every_device_is_checked(capsys):
     printed = capsys.readouterr().out
     assert "\ncpu: " in printed
     assert printed.count("\ncuda:") == max(1, torch.cuda.device_count())
-    assert ("\ncuda: not available\n" in printed) == (torch.cuda.device_count() == 0)
+    assert ("\ncuda: not available: torch" in printed) == (torch.cuda.device_count() == 0)
 
 
 @pytest.mark.usefixtures("_small")
@@ -101,3 +101,13 @@ def all_black(count: int, *, sh_degree: int) -> cvtgs.GaussianScene:
 def test_an_unknown_device_is_refused(capsys):
     assert main(["doctor", "--device", "nowhere"]) == 1
     assert "device 'nowhere' cannot be used here" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("build", "reason"), [(None, "is built for CPUs only"), ("13.0", "no driver for 13.0 or later")]
+)
+def test_the_reason_why_there_is_no_gpu(build, reason, monkeypatch, capsys):
+    monkeypatch.setattr("torch.version.cuda", build)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert main(["doctor"]) == 0
+    assert reason in capsys.readouterr().out

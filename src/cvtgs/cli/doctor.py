@@ -93,7 +93,7 @@ def doctor(options: argparse.Namespace) -> None:
             say(f"  images by {name:<7} {_renderer_state(name, one)}{use}")
         say(f"  nearest sites by {SEARCHES[search_name(one)]}")
     if options.device == "auto" and not gpus:
-        say("\ncuda: not available")
+        say(f"\ncuda: not available: {_reason_without_gpu()}")
     say(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one image")
     try:
         for line in _small_run(default):
@@ -104,6 +104,16 @@ def doctor(options: argparse.Namespace) -> None:
             f"the default path does not work on {default}: {reason}; try cvtgs doctor --device cpu."
         ) from error
     say("The default path works.")
+
+
+def _reason_without_gpu() -> str:
+    """Return why torch finds no GPU."""
+    import torch
+
+    built_for = torch.version.cuda or torch.version.hip
+    if built_for is None:
+        return f"torch {torch.__version__} is built for CPUs only"
+    return f"torch {torch.__version__} finds no GPU, or no driver for {built_for} or later"
 
 
 def _renderer_state(name: str, device: "torch.device") -> str:
