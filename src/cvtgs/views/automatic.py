@@ -166,13 +166,12 @@ def automatic_views(
     """Choose cameras for a scene of which nothing else is known.
 
     Position, size and up direction of the scene come from robust statistics of its visible
-    Gaussians (:func:`cvtgs.views.up.find_up`), so flyaways, sky shells and haze do not matter. The
-    cameras stand around the scene at several elevations. They stand inside and look across if the
-    middle is free, surfaces are all around and above, and the Gaussians behind these surfaces are
-    larger than those before them. They stand only where :class:`cvtgs.views.CameraPositions`
-    admits them, unless it admits no candidate. Every camera is scored by an image of 64 pixels.
-    If it is inside a Gaussian, has a near obstacle in its image, or sees nothing, the first good
-    alternate replaces it, or the best of them.
+    Gaussians, so flyaways, sky shells and haze do not matter. The cameras stand around the scene at
+    several elevations. They stand inside and look across if the middle is free, surfaces are all
+    around and above, and the Gaussians behind these surfaces are larger than those before them.
+    They stand only where :class:`cvtgs.views.CameraPositions` admits them, unless it admits no
+    candidate. Every camera is scored by an image of 64 pixels. If it is inside a Gaussian, has a
+    near obstacle in its image, or sees nothing, the first good alternate replaces it, or the best.
 
     The same scene, count, size and seed give the same cameras. Memory: a sample of at most
     30,000 Gaussians, and masks of the scene.
