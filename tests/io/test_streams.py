@@ -52,6 +52,18 @@ class Pipe(io.RawIOBase):
         return self.content.readinto(memoryview(buffer)[:100])
 
 
+def test_files_are_written_with_one_thread_of_torch(two_threads, monkeypatch) -> None:
+    """Others would wait for one another where other programs use the cores."""
+    counts = []
+
+    def write(scene: cvtgs.GaussianScene, file: io.BytesIO) -> None:
+        counts.append(torch.get_num_threads())
+
+    monkeypatch.setattr("cvtgs.io.ply.write_ply", write)
+    cvtgs.save(storable_scene(40, degree=0), io.BytesIO())
+    assert (counts, torch.get_num_threads()) == ([1], 2)
+
+
 @pytest.mark.parametrize("end", FORMATS)
 def test_a_stream_holds_the_bytes_of_a_file(tmp_path: Path, end: str) -> None:
     scene = replace(storable_scene(40, degree=0), comments=())
