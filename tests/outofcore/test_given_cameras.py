@@ -201,7 +201,7 @@ def test_cameras_of_a_capture_are_used_in_blocks(capsys, tmp_path, scene, is_giv
     write_json(folder / "transforms.json", transforms())
     words = ["simplify", tmp_path / "in.ply", tmp_path / "out.ply", "--preset", "matched"]
     words += ["--set", "visibility.views=4", "--set", "match.color_iterations=2"]
-    words += ["--memory", "900MB", "--workers", "1", "--rho", "0.05", "--report"]
+    words += ["--memory", "1GB", "--workers", "1", "--rho", "0.05", "--report"]
     words += [tmp_path / "report.json", *(["--cameras", folder] if is_given else [])]
     assert main([str(word) for word in words]) == 0
     text = " ".join(capsys.readouterr().out.split())

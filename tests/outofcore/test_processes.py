@@ -18,7 +18,7 @@ from cvtgs.cli.main import main
 from cvtgs.devices import core_count
 from cvtgs.errors import InvalidSceneError, RunError
 from cvtgs.outofcore import LocalWorkers, simplify_file
-from cvtgs.outofcore.memory import worker_count
+from cvtgs.outofcore.memory import ROOMY_BYTES, worker_count
 from process_cases import die, numbered, refuse, wait
 
 pytestmark = pytest.mark.slow  # every process loads torch
@@ -140,7 +140,7 @@ def test_no_process_is_left_behind_and_the_run_continues(source, tmp_path, sign)
 
 @pytest.mark.parametrize(
     ("memory", "wanted", "found"),
-    [(10**9, None, 1), (10**11, 3, 3), (4 * 10**9, 8, 4), (2**60, None, None)],
+    [(10**9, None, 1), (10**11, 3, 3), (8 * ROOMY_BYTES, 8, 4), (2**60, None, None)],
 )
 def test_the_number_of_workers_follows_memory_and_cores(memory, wanted, found):
     assert worker_count(memory, wanted) == (found or core_count())

@@ -203,6 +203,7 @@ def block_count(source: PlyRows, memory: int, *, merging: int = 0) -> int:
 def worker_count(memory: int, wanted: int | None = None) -> int:
     """Choose the number of processes that work on blocks: one per core, if none is wanted.
 
-    There is at most one per GB, which torch and a block of some size need; on Windows at most 61.
+    There is at most one per GB (1.3 GB with the CUDA build of torch), which torch and a block of
+    some size need; on Windows at most 61.
     """
     return pool_size(max(1, min(wanted or core_count(), memory // (2 * ROOMY_BYTES))))
