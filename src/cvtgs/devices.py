@@ -8,7 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TypeVar
@@ -339,9 +339,15 @@ def threads_for_chunks() -> Iterator[None]:
             _OWN.for_chunks = 1
 
 
-def idle_threads_sleep() -> bool:
-    """Return whether idle threads of torch sleep soon, as on the command line (``startup.py``)."""
-    return os.environ.get("OMP_WAIT_POLICY", "").upper() == "PASSIVE"
+@contextmanager
+def without_spinning() -> Iterator[None]:
+    """Leave the threads of torch to chunks, unless idle ones soon sleep instead of spinning.
+
+    They do on the command line (``startup.py``); results must not depend on their number.
+    """
+    sleeps = os.environ.get("OMP_WAIT_POLICY", "").upper() == "PASSIVE"
+    with nullcontext() if sleeps else threads_for_chunks():
+        yield
 
 
 def kernel_threads() -> int:

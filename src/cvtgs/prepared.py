@@ -1,7 +1,6 @@
 """Prepared: a scene to simplify repeatedly, with a fallback if the device lacks memory."""
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from functools import partial
 from typing import TypeVar
 
@@ -18,10 +17,10 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shortfall, target_count
 from cvtgs.devices import (
     chosen_device,
-    idle_threads_sleep,
     threads_for_chunks,
     within_memory,
     without_autocast,
+    without_spinning,
 )
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.grouping import OrderedRows, add_neighbors, order_rows
@@ -138,9 +137,8 @@ class Prepared:
         Gradients, inference mode and autocast are off, whatever the program has set: results do not
         depend on inputs in a differentiable way, and a refinement needs gradients of its own.
         """
-        shares = self._config.uses_images or not idle_threads_sleep()
         with (
-            threads_for_chunks() if shares else nullcontext(),
+            threads_for_chunks() if self._config.uses_images else without_spinning(),
             torch.inference_mode(mode=False),
             torch.no_grad(),
             without_autocast(),

@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, Literal
 import torch
 
 from cvtgs.counts import whole_number
-from cvtgs.devices import threads_for_chunks, usable_device
+from cvtgs.devices import usable_device, without_spinning
 from cvtgs.errors import (
     DroppedDataWarning,
     FileFormatError,
@@ -188,6 +188,7 @@ def load(
         return scene.to(device)
 
 
+@without_spinning()
 def save(
     scene: GaussianScene,
     path: str | os.PathLike[str] | ByteSink,
@@ -262,7 +263,7 @@ def save(
         warn(f"{name}: files of this format do not hold {'; '.join(dropped)}.", DroppedDataWarning)
     options = {"version": spz_version, "axes": axes} if suffix == ".spz" else {}
     write: Callable[..., None] = resolve_name(_WRITERS[suffix])
-    with output as file, threads_for_chunks():
+    with output as file:
         write(scene, file, **options)
 
 
