@@ -288,17 +288,7 @@ def order_rows(
 
 
 def add_neighbors(ordered: OrderedRows, target: int, config: AllocationConfig) -> OrderedRows:
-    """Add the neighbours of single Gaussians, if merging starts from single Gaussians.
-
-    Args:
-        ordered: The result of :func:`order_rows`.
-        target: Number of cells.
-        config: Number of neighbours.
-
-    Returns:
-        The same with neighbours, 48 bytes per Gaussian, where pairs merge; unchanged if it has them
-        or needs none.
-    """
+    """Add the neighbours of single Gaussians, 48 bytes each, if merging starts from these."""
     points, total = ordered.points, len(ordered.filtered)
     from_singles = target < total and finer_count(target, total, config) == total
     if not from_singles or points.neighbors is not None or points.moments is None:

@@ -21,8 +21,7 @@ from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
 from cvtgs.grouping import OrderedRows, allocate, collect_cells, tessellate_rows, weigh_rows
 from cvtgs.math.segments import segment_ids
-from cvtgs.mergenet import correct_cells
-from cvtgs.mergenet.published import Net
+from cvtgs.mergenet import Net, correct_cells
 from cvtgs.report import CellStatistics, MatchReport
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities

@@ -24,8 +24,7 @@ from cvtgs.devices import (
 )
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.grouping import OrderedRows, add_neighbors, order_rows
-from cvtgs.mergenet import Checkpoint
-from cvtgs.mergenet.published import Net
+from cvtgs.mergenet import Checkpoint, Net
 from cvtgs.pipeline import Reduced, level_facts, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified, SimplifyReport, origin_of_views

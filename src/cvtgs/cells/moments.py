@@ -83,8 +83,8 @@ def gaussian_moments(
         masses: Mass of each.
         apparent_masses: Mass of each as seen in images.
         components: Result of :func:`view_components`; None for no view-dependent colour.
-        unit: Divisor of both masses; None divides each by its mean, or
-            a million medians if that is less.
+        unit: Divisor of both masses; None divides each by its mean, or a million medians
+            if that is less.
 
     Returns:
         The moments, in the order of the rows.

@@ -28,7 +28,7 @@ def integrated_depth(depths: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def depth_from_integrated(values: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Return the optical depth at the centre, at most 13.8: the inverse of the above."""
+    """Return the optical depth at the centre, the inverse of :func:`integrated_depth`."""
     tiny = torch.finfo(values.dtype).tiny
     values = values.clamp_max(FULL_DEPTH)
     depths = torch.maximum(values, -parameters.positive_log(1 - values / FULL_DEPTH)).clamp(

@@ -27,8 +27,7 @@ from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.locks import hidden_path
 from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors, save_tensors
-from cvtgs.mergenet import Checkpoint, load_checkpoint, save_checkpoint
-from cvtgs.mergenet.published import Net
+from cvtgs.mergenet import Checkpoint, Net, load_checkpoint, save_checkpoint
 from cvtgs.outofcore.memory import CELL_ROOM
 from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, write_scan
 from cvtgs.processes import Workers

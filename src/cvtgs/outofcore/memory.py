@@ -62,8 +62,8 @@ def read_bytes(text: str) -> int:
     if amount < LEAST_BYTES:
         raise InvalidArgumentError(
             f"memory must be at least {LEAST_BYTES / 1e6:g} MB: torch and scipy take "
-            f"{LIBRARY_BYTES / 1e6:g} MB, "
-            f"and the sample, the grids and a small block need the rest; found {text!r}."
+            f"{LIBRARY_BYTES / 1e6:g} MB, and the sample, the grids and a small block need the "
+            f"rest; found {text!r}."
         )
     return amount
 

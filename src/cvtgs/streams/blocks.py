@@ -26,7 +26,7 @@ from cvtgs.io.atomic import make_folder
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
-from cvtgs.mergenet.published import Net
+from cvtgs.mergenet import Net
 from cvtgs.outofcore import Workers
 from cvtgs.outofcore.job import Job, job_folder, started
 from cvtgs.outofcore.memory import available_memory, block_count, memory_to_plan, sample_rows

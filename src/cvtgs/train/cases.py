@@ -19,9 +19,9 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.filters import filter_rows
 from cvtgs.grouping import allocate, collect_cells, tessellate_rows, weigh_rows
 from cvtgs.io import load_cameras
-from cvtgs.mergenet import MergeNet, Residuals, compose
+from cvtgs.mergenet import MergeNet, Net, Residuals, compose
 from cvtgs.mergenet.apply import compose_published
-from cvtgs.mergenet.published import Net, describe_published
+from cvtgs.mergenet.published import describe_published
 from cvtgs.pipeline import merge_and_inflate
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene

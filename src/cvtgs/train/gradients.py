@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from cvtgs.devices import thread_count
-from cvtgs.mergenet import PublishedMergeNet
-from cvtgs.mergenet.published import Net
+from cvtgs.mergenet import Net, PublishedMergeNet
 from cvtgs.processes import LocalWorkers
 from cvtgs.train.cache import prepare_scene
 from cvtgs.train.cases import Case, DeviceCopies, TargetViews

@@ -18,9 +18,9 @@ from cvtgs.evaluation.scorer import MOST_PSNR
 from cvtgs.losses import image_loss, relative_loss
 from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.math.segments import segment_ids, true_rows
-from cvtgs.mergenet import MergeNet, PublishedMergeNet, Residuals
+from cvtgs.mergenet import MergeNet, Net, PublishedMergeNet, Residuals
 from cvtgs.mergenet.apply import compose_published
-from cvtgs.mergenet.published import Net, describe_published
+from cvtgs.mergenet.published import describe_published
 from cvtgs.rendering import contributions, render
 from cvtgs.scene import GaussianScene
 from cvtgs.train.cases import Case, MergedScene, TargetViews

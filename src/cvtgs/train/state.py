@@ -15,8 +15,7 @@ from torch import Tensor
 import cvtgs
 from cvtgs.errors import CheckpointError
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
-from cvtgs.mergenet import LearnedScene, MergeNet, load_checkpoint
-from cvtgs.mergenet.published import Net
+from cvtgs.mergenet import LearnedScene, MergeNet, Net, load_checkpoint
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.train.config import TrainConfig
 
