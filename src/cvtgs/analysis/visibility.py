@@ -1,10 +1,12 @@
 """Ambient visibility: how freely a Gaussian can be seen from nearby, computed without rendering."""
 
+from functools import partial
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.devices import row_chunks
+from cvtgs.devices import in_chunks, in_threads, row_chunks
 from cvtgs.math.frames import RobustFrame
 
 VOXEL = 0.04
@@ -65,15 +67,18 @@ def add_depths(
     frame: RobustFrame,
 ) -> Int[Tensor, "n"]:
     """Add the optical depths of some Gaussians to a grid, in place; return the voxel of each."""
-    voxels = torch.empty(len(means), dtype=torch.int32, device=means.device)
-    for part in row_chunks(len(means), CHUNK, means.device):
-        voxel, shrinkage = _voxels_of(means[part], frame)
-        voxels[part] = voxel.to(torch.int32)
+
+    def depths_of(part: slice) -> tuple[Tensor, Tensor]:
+        voxels, shrinkage = _voxels_of(means[part], frame)
         depths = masses[part] * (shrinkage / (frame.radius * VOXEL)).square()
+        return voxels, (depths.clamp_max(MAX_DEPTH) * FIXED_POINT).round().to(torch.int64)
+
+    found, chunks = [sums[:0].to(torch.int32)], row_chunks(len(means), CHUNK, means.device)
+    for voxels, depths in in_threads(depths_of, chunks, means.device):
         # Integer sums do not depend on the order, so every device gives the same grid.
-        whole = (depths.clamp_max(MAX_DEPTH) * FIXED_POINT).round().to(torch.int64)
-        sums.index_add_(0, voxel, whole)
-    return voxels
+        sums.index_add_(0, voxels, depths)
+        found.append(voxels.to(torch.int32))
+    return torch.cat(found)
 
 
 def visibility_grid(sums: Int[Tensor, "voxels"]) -> Float[Tensor, "voxels"]:
@@ -84,10 +89,9 @@ def visibility_grid(sums: Int[Tensor, "voxels"]) -> Float[Tensor, "voxels"]:
     for axis in range(3):  # the transmittance of the next voxels, averaged over six directions
         across = 1 if axis == 0 else 0  # slabs along another axis, to bound memory
         slabs = zip(grid.split(SLAB, across), visible.split(SLAB, across), strict=True)
-        for slab, target in slabs:
-            through = torch.exp(-_windows(slab, axis))
-            target.add_(through.narrow(axis, 0, size))
-            target.add_(through.narrow(axis, REACH + 1, size))
+        # Slabs share no voxel, so threads may fill them in any order.
+        for _ in in_threads(partial(_add_transmittance, axis), slabs, sums.device):
+            pass
     return torch.nn.functional.pad(visible.div_(6).flatten(), (0, 1), value=1.0)
 
 
@@ -95,9 +99,11 @@ def visibility_at(
     grid: Float[Tensor, "voxels"], means: Float[Tensor, "n 3"], frame: RobustFrame
 ) -> Float[Tensor, "n"]:
     """Look up the ambient visibility of Gaussians in a :func:`visibility_grid`."""
-    chunks = row_chunks(len(means), CHUNK, means.device)
-    parts = [grid[_voxels_of(means[part], frame)[0]] for part in chunks]
-    return torch.cat([grid[:0], *parts]).double()
+
+    def visible_at(part: slice) -> Tensor:
+        return grid[_voxels_of(means[part], frame)[0]]
+
+    return torch.cat(in_chunks(visible_at, len(means), CHUNK, means.device)).double()
 
 
 def _voxels_of(
@@ -111,6 +117,14 @@ def _voxels_of(
     inside = ((voxels >= 0) & (voxels < size)).all(dim=1)
     i, j, k = voxels.unbind(1)
     return torch.where(inside, (i * size + j) * size + k, size**3), shrinkage
+
+
+def _add_transmittance(axis: int, slabs: tuple[Tensor, Tensor]) -> None:
+    """Add the transmittance of the next voxels in both directions to the second slab."""
+    (depths, target), size = slabs, 2 * HALF_GRID
+    through = torch.exp(-_windows(depths, axis))
+    target.add_(through.narrow(axis, 0, size))
+    target.add_(through.narrow(axis, REACH + 1, size))
 
 
 def _windows(slab: Float[Tensor, "a b c"], axis: int) -> Float[Tensor, "d e f"]:

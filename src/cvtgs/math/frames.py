@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.devices import row_chunks
+from cvtgs.devices import in_chunks, in_threads
 
 RADIUS_QUANTILE = 0.7
 """The share of points within the radius of a frame."""
@@ -59,10 +59,12 @@ class RobustFrame:
         Returns:
             Distances in float64.
         """
-        found = torch.empty(len(points), dtype=torch.float64, device=points.device)
-        for part in row_chunks(len(points), CHUNK, points.device):
-            found[part] = torch.linalg.vector_norm(self.normalize(points[part]), dim=1)
-        return found
+
+        def distances_of(part: slice) -> Tensor:
+            norms: Tensor = torch.linalg.vector_norm(self.normalize(points[part]), dim=1)
+            return norms
+
+        return torch.cat(in_chunks(distances_of, len(points), CHUNK, points.device))
 
     def contract(self, points: Float[Tensor, "n 3"], strength: float = 1.0) -> Float[Tensor, "n 3"]:
         """Express points in radii, and contract those beyond one radius logarithmically.
@@ -100,7 +102,8 @@ def robust_frame(points: Float[Tensor, "n 3"]) -> RobustFrame:
         >>> frame.center.tolist(), frame.radius
         ([1.0, 0.0, 0.0], 1.0)
     """
-    center = torch.stack(list(map(torch.median, points.unbind(1)))).double()
+    medians = in_threads(torch.median, points.unbind(1), points.device)
+    center = torch.stack(list(medians)).double()
     distances = RobustFrame(center=center, radius=1.0).distances(points)
     radius = _radius(distances) or _radius(distances[distances > 0.0]) or 1.0
     return RobustFrame(center=center, radius=radius)
@@ -132,10 +135,13 @@ def morton_order(
     """
     low = points.amin(dim=0)
     side = (points.amax(dim=0) - low).amax().clamp_min(torch.finfo(points.dtype).tiny)
-    code = torch.zeros(len(points), dtype=torch.int64, device=points.device)
-    for axis in range(3):
+
+    def spread(axis: int) -> Tensor:
         steps = ((points[:, axis] - low[axis]) / side * (2**BITS - 1)).to(torch.int64)
-        code |= _spread_bits(steps) << axis
+        return _spread_bits(steps) << axis
+
+    x, y, z = in_threads(spread, range(3), points.device)
+    code = x | y | z
     codes, order = torch.sort(code, stable=True)
     if ties is not None and code.device.type != "cpu":  # more work, but no synchronization
         rows = torch.sort(ties, stable=True).indices
