@@ -5,8 +5,9 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 __all__ = [
     "CheckpointError",
@@ -35,6 +36,10 @@ _NO_MEMORY = re.compile(
     r"returned NULL without setting an exception"
 )
 """Out-of-memory messages of torch, CUDA, the dynamic loader and Python's imports."""
+
+
+RENAMINGS: ContextVar[tuple[Callable[[str], str], ...]] = ContextVar("RENAMINGS", default=())
+"""What replaces the names of temporary files in warnings, while streams are read."""
 
 
 class CvtgsError(Exception):
@@ -114,6 +119,8 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
 
     Lines of cvtgs are skipped, and those between them: decorators of torch and of contextlib.
     """
+    for rename in RENAMINGS.get():
+        text = rename(text)
     level, frame, skipped = 1, sys._getframe(), {"cvtgs", "contextlib", "torch"}
     while frame.f_back and str(frame.f_globals.get("__name__")).partition(".")[0] in skipped:
         level, frame = level + 1, frame.f_back

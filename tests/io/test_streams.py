@@ -6,8 +6,6 @@ import json
 import shutil
 import sys
 import tempfile
-import threading
-import warnings
 import zipfile
 from collections import OrderedDict
 from contextlib import nullcontext
@@ -28,7 +26,6 @@ from cvtgs.errors import (
     OutputError,
 )
 from cvtgs.io import losses, to_dict
-from cvtgs.io.streams import file_of
 from format_cases import storable_scene
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
 from scenes import same_bits
@@ -156,14 +153,12 @@ def test_messages_about_streams_name_the_stream(tmp_path: Path) -> None:
     ply = stream.getvalue().replace(b"end_header\n", face + b"end_header\n", 1) + b"\0"
     with pytest.warns(DroppedDataWarning, match="^the BytesIO: left out element 'face'"):
         cvtgs.load(io.BytesIO(ply))
-    before = warnings.showwarning
     gltf = {"asset": {"version": "2.0"}, "buffers": [{"byteLength": 9, "uri": "no.bin"}]}
     cvtgs.save(storable_scene(5, degree=0), tmp_path / "a.gltf")
     document = json.loads((tmp_path / "a.gltf").read_text())
     document["buffers"] = gltf["buffers"]
     with pytest.raises(InputNotFoundError, match=r"^no\.bin: the file to read must exist"):
         cvtgs.load(io.BytesIO(json.dumps(document).encode()), format=".gltf")
-    assert warnings.showwarning is before
 
 
 @pytest.mark.parametrize("end", [".glb", ".gltf", ".splat", ".usda"])
@@ -255,23 +250,6 @@ def test_streams_that_break_and_closed_ones_are_refused() -> None:
         cvtgs.save(storable_scene(5), closed)
 
 
-def test_warnings_are_shown_as_before_after_streams_were_read_in_threads() -> None:
-    before = warnings.showwarning
-    together = threading.Barrier(3, timeout=30)
-
-    def read() -> None:
-        together.wait()
-        for _ in range(10):
-            cvtgs.load(io.BytesIO(GOOD))
-
-    threads = [threading.Thread(target=read) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert warnings.showwarning is before
-
-
 @pytest.mark.parametrize(
     ("work", "error", "text"),
     [
@@ -333,22 +311,6 @@ def test_a_level_of_a_stream_that_has_none_is_refused() -> None:
 def test_dropped_data_is_warned_about_for_streams() -> None:
     with pytest.warns(DroppedDataWarning, match="the BytesIO: files of this format do not hold"):
         cvtgs.save(storable_scene(5), io.BytesIO(), format=".splat")
-
-
-def test_warnings_that_are_caught_around_streams_can_be_shown_later(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A thread may put the function of a stream back after the stream was read."""
-    said: list[str] = []
-    own = lambda message, *others: said.append(str(message))  # noqa: E731
-    monkeypatch.setattr(warnings, "showwarning", own)
-    with file_of(io.BytesIO(GOOD)):
-        left_behind = warnings.showwarning
-    warnings.showwarning = left_behind
-    cvtgs.load(io.BytesIO(GOOD))
-    left_behind("shown", UserWarning, "file", 1)
-    assert said == ["shown"]
-    assert warnings.showwarning is own
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the maps of Linux")

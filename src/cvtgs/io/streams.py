@@ -3,17 +3,23 @@
 import io
 import os
 import re
-import threading
-import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import SpooledTemporaryFile, TemporaryDirectory
 from traceback import clear_frames
-from typing import Any, BinaryIO, ClassVar, Protocol, cast
+from typing import BinaryIO, Protocol, cast
 
-from cvtgs.errors import CvtgsError, FileFormatError, InputError, OutputError, reason_of
+from cvtgs.errors import (
+    RENAMINGS,
+    CvtgsError,
+    FileFormatError,
+    InputError,
+    OutputError,
+    reason_of,
+)
 
 MEMORY_BYTES = 1 << 26
 """A file is built in memory up to this size, and on disk beyond it."""
@@ -101,37 +107,12 @@ def _free_frames(error: BaseException) -> None:
 
 @contextmanager
 def named_in_warnings(path: Path, name: str) -> Iterator[None]:
-    """Show warnings with the name of the stream.
-
-    Python has one function that shows warnings, so it is replaced once for all streams that are
-    read at the same time.
-    """
-    with _Shown.lock:
-        if warnings.showwarning is not _show:  # it may still be, put back by catch_warnings
-            _Shown.before, warnings.showwarning = warnings.showwarning, _show
-        _Shown.names[path] = name
+    """Let warnings of cvtgs in the context name a stream instead of its temporary file."""
+    token = RENAMINGS.set((*RENAMINGS.get(), partial(_renamed, path=path, name=name)))
     try:
         yield
     finally:
-        with _Shown.lock:
-            del _Shown.names[path]
-            if not _Shown.names and warnings.showwarning is _show:
-                warnings.showwarning = _Shown.before
-
-
-class _Shown:
-    """The streams that are being read, by temporary file, and what shows warnings without them."""
-
-    lock = threading.Lock()
-    names: ClassVar[dict[Path, str]] = {}
-    before: ClassVar[Callable[..., None]] = staticmethod(warnings.showwarning)
-
-
-def _show(message: Warning | str, category: type[Warning], *others: Any, **named: Any) -> None:
-    text = renamed = str(message)
-    for path, name in tuple(_Shown.names.items()):
-        renamed = _renamed(renamed, path, name)
-    _Shown.before(message if renamed == text else category(renamed), category, *others, **named)
+        RENAMINGS.reset(token)
 
 
 def _renamed(text: str, path: Path, name: str) -> str:
