@@ -181,7 +181,7 @@ def test_clamped_values_are_warned_about(tmp_path: Path) -> None:
 
 GOOD = by_hand(RANGES + COLORS)
 DAMAGED = {
-    "cut short": (GOOD[:-1], "bytes for the rows that its header promises, found"),
+    "cut short": (GOOD[:-1], "the file is cut short: its header promises"),
     "chunks": (
         by_hand(chunks=2),
         "must hold at least one vertex and a chunk for every 256 of them, found 1 vertices and 2 "
@@ -191,7 +191,7 @@ DAMAGED = {
     "none": (by_hand(rows=0, chunks=0), "found 0 vertices and 0 chunks."),
     "lying count": (
         GOOD.replace(b"vertex 1", b"vertex 99999999999").replace(b"chunk 1", b"chunk 390625000"),
-        "bytes for the rows that its header promises, found",
+        "the file is cut short: its header promises",
     ),
     "ascii": (
         GOOD.replace(b"binary_little_endian", b"ascii"),

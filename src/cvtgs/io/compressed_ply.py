@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from jaxtyping import Float, UInt8, UInt32
+from jaxtyping import Float, UInt32
 from numpy.typing import NDArray
 
 from cvtgs.errors import FileFormatError
@@ -27,6 +27,7 @@ from cvtgs.io.arrays import (
 from cvtgs.io.files import open_input
 from cvtgs.io.limits import FORMAT_LIMITS
 from cvtgs.io.ply.header import Element, Header, header_bytes, read_header, row_dtype
+from cvtgs.io.ply.properties import check_size
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 
@@ -125,10 +126,7 @@ def _rest(rows: Rows | None, count: int) -> Float[np.ndarray, "n k 3"]:
     """Decode bytes to [-4, 4]: 0 and 255 to the ends, others to the centres of their steps."""
     if rows is None:
         return np.empty((count, 0, 3), np.float32)
-    names = rows.dtype.names or ()
-    stored: UInt8[np.ndarray, "n k"] = np.stack(
-        [rows[f"f_rest_{i}"] for i in range(len(names))], axis=1
-    )
+    stored = np.stack([rows[f"f_rest_{i}"] for i in range(len(rows.dtype.names or ()))], axis=1)
     table = (np.arange(256, dtype=np.float32) + np.float32(0.5)) / 256
     table[[0, 255]] = 0, 1
     values: Float[np.ndarray, "n k"] = (8 * (table - np.float32(0.5)))[stored]
@@ -179,19 +177,10 @@ def _read_tables(file: BinaryIO, header: Header, path: Path) -> dict[str, Rows]:
     """Read every element, after checking that the file is long enough for all."""
     if any(table.has_lists for table in header.elements):
         raise FileFormatError(f"{path}: a compressed PLY must have no list properties, found one.")
-    dtypes = {table.name: row_dtype(table.columns) for table in header.elements}
-    wanted = header.data_offset + sum(
-        table.count * dtypes[table.name].itemsize for table in header.elements
-    )
-    size = os.fstat(file.fileno()).st_size
-    if size < wanted:
-        raise FileFormatError(
-            f"{path}: must have {wanted:,} bytes for the rows that its header promises, "
-            f"found {size:,}."
-        )
+    check_size(header, header.elements[-1], path=str(path), size=os.fstat(file.fileno()).st_size)
     file.seek(header.data_offset)
     return {
-        table.name: np.fromfile(file, dtypes[table.name], table.count)
+        table.name: np.fromfile(file, row_dtype(table.columns), table.count)
         for table in header.elements
         if table.properties
     }
@@ -217,7 +206,8 @@ def write_compressed_ply(scene: GaussianScene, file: BinaryIO) -> None:
     ranges, words = _packed(arrays, order)
     file.write(ranges.astype("<f4").tobytes())
     file.write(words.astype("<u4").tobytes())
-    file.write(_rest_bytes(rest).tobytes())
+    steps = np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255)
+    file.write(steps.astype(np.uint8).tobytes())
 
 
 def _flyaways_last(arrays: Arrays, order: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -251,16 +241,13 @@ def _packed(
     color, color_range = _fractions(colors_of_sh0(arrays.sh0[order]))
     largest, others = drop_largest(arrays.quats[order])
     none = np.zeros(len(order), np.uint32)
-    words = np.stack(
-        [
-            _pack(place, _THREE_BITS, high=none),
-            _pack(others * HALF_RANGE + 0.5, _QUAT_BITS, high=largest.astype("u4")),
-            _pack(scale, _THREE_BITS, high=none),
-            _pack(color, _COLOR_BITS[:3], high=none) << np.uint32(8) | opacities,
-        ],
-        axis=1,
-    )
-    return np.concatenate([place_range, scale_range, color_range], axis=1), words
+    words = [
+        _pack(place, _THREE_BITS, high=none),
+        _pack(others * HALF_RANGE + 0.5, _QUAT_BITS, high=largest.astype("u4")),
+        _pack(scale, _THREE_BITS, high=none),
+        _pack(color, _COLOR_BITS[:3], high=none) << np.uint32(8) | opacities,
+    ]
+    return np.concatenate([place_range, scale_range, color_range], axis=1), np.stack(words, axis=1)
 
 
 def _fractions(
@@ -274,10 +261,6 @@ def _fractions(
     below, width = np.repeat(low, size, axis=0), np.repeat(high - low, size, axis=0)
     fractions = np.where(width > 0, (halves - below) / np.where(width > 0, width, 1), 0)
     return fractions, 2 * np.concatenate([low, high], axis=1)
-
-
-def _rest_bytes(rest: Float[np.ndarray, "n k"]) -> UInt8[np.ndarray, "n k"]:
-    return np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
 
 
 def _pack(

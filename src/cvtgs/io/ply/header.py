@@ -1,7 +1,8 @@
 """Read the header of a PLY file as a small typed value, and write it."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, NamedTuple, get_args
@@ -26,7 +27,7 @@ _OTHER_FILES = {
     b"PK\x03\x04": "a zip archive; unpack it first, or rename it if it is a .sog",
     b"<": "a web page; failed downloads often leave one",
 }
-_MAX_COUNT_DIGITS = 18
+_COUNT = re.compile("[0-9]{1,18}")
 _MAX_NAME_LETTERS = 200
 
 
@@ -65,6 +66,7 @@ TYPE_NAMES: Mapping[str, str] = {
 """Canonical names of PLY number types, by all their names."""
 
 FLOAT_TYPES = ("float", "double")
+_LENGTH_NAMES = [name for name, kind in TYPE_NAMES.items() if kind not in FLOAT_TYPES]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,10 +134,10 @@ def read_header(file: BinaryIO, path: str) -> Header:
                 comments.append(line.lstrip()[len("comment ") :].rstrip())
             case ["format", kind, "1.0"] if encoding is None and kind in get_args(Encoding):
                 encoding = kind  # type: ignore[assignment]
-            case ["element", name, count] if _is_count(count) and _is_name(name):
+            case ["element", name, count] if _COUNT.fullmatch(count) and _is_name(name):
                 tables.append((name, int(count), []))
             case ["property", "list", length, kind, name] if (
-                tables and _is_list(length, kind) and _is_name(name)
+                tables and length in _LENGTH_NAMES and kind in TYPE_NAMES and _is_name(name)
             ):
                 tables[-1][2].append(
                     Property(name=name, type=TYPE_NAMES[kind], count_type=TYPE_NAMES[length])
@@ -153,18 +155,12 @@ def read_header(file: BinaryIO, path: str) -> Header:
         Element(name=name, count=count, properties=tuple(properties))
         for name, count, properties in tables
     )
-    _check_unique(elements, path)
+    _check_unique(elements, f"{path}: elements")
+    for element in elements:
+        _check_unique(element.properties, f"{path}: properties of element {shown(element.name)}")
     return Header(
         encoding=encoding, elements=elements, comments=tuple(comments), data_offset=data_offset
     )
-
-
-def _kind_of(block: bytes) -> str:
-    """Describe a file that is not a PLY file, judged by its first bytes."""
-    for start, found in _OTHER_FILES.items():
-        if block.startswith(start):
-            return found
-    return repr(block[:8])
 
 
 def _header_lines(block: bytes, path: str) -> tuple[list[str], int]:
@@ -173,9 +169,9 @@ def _header_lines(block: bytes, path: str) -> tuple[list[str], int]:
         raise FileFormatError(f"{path}: must be a PLY file, found an empty file.")
     first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", block)
     if not first:
-        raise FileFormatError(
-            f"{path}: a PLY file must start with the line 'ply', found {_kind_of(block)}."
-        )
+        kinds = (kind for start, kind in _OTHER_FILES.items() if block.startswith(start))
+        found = next(kinds, repr(block[:8]))
+        raise FileFormatError(f"{path}: a PLY file must start with the line 'ply', found {found}.")
     old_mac = first[1] == b"\r"
     newline, blanks = (b"\r", rb"[ \t]*") if old_mac else (b"\n", rb"[ \t]*\r?")
     end = re.compile(newline + rb"[ \t]*end_header" + blanks + newline).search(
@@ -198,35 +194,15 @@ def _decode(line: bytes) -> str:
         return line.decode("latin-1")
 
 
-def _is_count(text: str) -> bool:
-    return text.isascii() and text.isdecimal() and len(text) <= _MAX_COUNT_DIGITS
-
-
 def _is_name(text: str) -> bool:
     """Return whether a name is short enough for error texts; real ones have about 20 letters."""
     return len(text) <= _MAX_NAME_LETTERS
 
 
-def _is_list(length: str, kind: str) -> bool:
-    return kind in TYPE_NAMES and TYPE_NAMES.get(length, "float") not in FLOAT_TYPES
-
-
-def _check_unique(elements: tuple[Element, ...], path: str) -> None:
-    tables: set[str] = set()
-    for element in elements:
-        if element.name in tables:
-            raise FileFormatError(
-                f"{path}: elements must have different names, found {shown(element.name)} twice."
-            )
-        tables.add(element.name)
-        columns: set[str] = set()
-        for prop in element.properties:
-            if prop.name in columns:
-                raise FileFormatError(
-                    f"{path}: properties of element {shown(element.name)} must have different "
-                    f"names, found {shown(prop.name)} twice."
-                )
-            columns.add(prop.name)
+def _check_unique(named: Sequence[Element | Property], what: str) -> None:
+    for name, count in Counter(one.name for one in named).items():
+        if count > 1:
+            raise FileFormatError(f"{what} must have different names, found {shown(name)} twice.")
 
 
 def is_compressed_ply(path: Path) -> bool:

@@ -11,18 +11,14 @@ from cvtgs.io.ply.header import FLOAT_TYPES, Element, Header, Layout
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.text import shown
 
-_OPTIONAL = ("scale_2",)
-"""Standard properties that a file may lack: 2DGS has two scales."""
-
 _REST_NAME = re.compile(r"f_rest_(0|[1-9][0-9]*)")
 
 
 class Slot(NamedTuple):
-    """The place of the column of a property in a scene."""
+    """The tensor of a property in a scene, and the index of its column, such as ``(..., 0)``."""
 
     tensor: str
     column: tuple[Any, ...]
-    """Index into that tensor, for example ``(..., 0)``."""
 
 
 def standard_slots(rest_count: int) -> dict[str, Slot]:
@@ -79,21 +75,20 @@ def find_vertices(header: Header, path: str) -> Element:
     return vertex
 
 
-def check_size(header: Header, vertex: Element, *, path: str, size: int) -> None:
-    """Check that a file is long enough for its rows, before memory is allocated for them."""
-    before = header.elements[: header.elements.index(vertex)]
+def check_size(header: Header, table: Element, *, path: str, size: int) -> None:
+    """Check that a file is long enough for an element, before memory is allocated for its rows."""
+    before = header.elements[: header.elements.index(table)]
     room = size - header.data_offset
     room -= sum(element.count * element.row_bytes(header.encoding) for element in before)
     if header.encoding == "ascii":
         room += 1  # the last line may lack its newline
-    row_bytes = vertex.row_bytes(header.encoding)
-    if vertex.count * row_bytes > room:
-        exact = header.encoding != "ascii" and not vertex.has_lists
-        exact = exact and not any(element.has_lists for element in before)
-        rows = max(room, 0) // row_bytes
+    row_bytes = table.row_bytes(header.encoding)
+    if table.count * row_bytes > room:
+        exact = header.encoding != "ascii" and not any(one.has_lists for one in (*before, table))
+        rows = max(room, 0) // max(row_bytes, 1)
         raise FileFormatError(
-            f"{path}: the file is cut short: its header promises {vertex.count:,} rows of "
-            f"'vertex', found {'' if exact else 'room for at most '}{rows:,}."
+            f"{path}: the file is cut short: its header promises {table.count:,} rows of "
+            f"{shown(table.name)}, found {'' if exact else 'room for at most '}{rows:,}."
         )
 
 
@@ -116,10 +111,11 @@ def _check_properties(vertex: Element, path: str) -> None:
         raise FileFormatError(
             f"{path}: property {shown(lists[0])} of 'vertex' must be a number, found a list."
         )
-    missing = [name for name in standard_slots(0) if name not in scalars and name not in _OPTIONAL]
+    needed = standard_slots(0).keys() - {"scale_2"}  # 2DGS has two scales
+    missing = [name for name in standard_slots(0) if name in needed and name not in scalars]
     if missing:
         names = ", ".join(missing)
-        is_cloud = set(missing) == set(standard_slots(0)) - set(_OPTIONAL) - set("xyz")
+        is_cloud = set(missing) == needed - set("xyz")
         hint = "; train a scene from a point cloud or mesh first" if is_cloud else ""
         raise FileFormatError(
             f"{path}: a 3DGS scene must have the 'vertex' properties x, y, z, f_dc_0..2, opacity, "

@@ -58,7 +58,7 @@ def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -
         if can_map(header):
             chunks = _mapped_chunks(file, header)
         else:
-            rows = _parsed_rows(file, header, vertex=vertex, path=where)
+            rows = _parsed_rows(header, vertex, where)
             starts = range(0, vertex.count, _CHUNK_ROWS)
             chunks = (rows[start : start + _CHUNK_ROWS] for start in starts)
         scene = assemble(
@@ -185,7 +185,7 @@ def _mapped_chunks(file: BinaryIO, header: Header) -> Iterator[NDArray[Any]]:
         yield np.memmap(file, dtype, "r", offset, shape).view(np.ndarray)
 
 
-def _parsed_rows(file: BinaryIO, header: Header, *, vertex: Element, path: str) -> NDArray[Any]:
+def _parsed_rows(header: Header, vertex: Element, path: str) -> NDArray[Any]:
     """Read the vertex rows of any PLY file; ASCII rows and rows with lists are held in memory."""
     try:
         from plyfile import PlyData, PlyElementParseError, PlyParseError  # noqa: PLC0415
@@ -195,9 +195,8 @@ def _parsed_rows(file: BinaryIO, header: Header, *, vertex: Element, path: str) 
             f"{how_to_install('plyfile')}."
         ) from error
     needed = header.elements[: header.elements.index(vertex) + 1]
-    stream = _CleanStream(file, header, plain_header=_plain_header(header, needed))
     try:
-        with warnings.catch_warnings():
+        with _CleanStream(path, header, needed) as stream, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # from numpy, about empty lists
             data = PlyData.read(stream)[f"e{len(needed) - 1}"].data
     except PlyElementParseError as error:
@@ -225,15 +224,15 @@ def _plain_header(header: Header, elements: tuple[Element, ...]) -> bytes:
     return "\n".join([*lines, "end_header", ""]).encode()
 
 
-class _CleanStream(io.BufferedIOBase):
+class _CleanStream(io.BufferedReader):
     """A PLY file with a replaced header; positions are those of the original file."""
 
-    def __init__(self, file: BinaryIO, header: Header, *, plain_header: bytes) -> None:
-        self._file = file
-        self._pending = io.BytesIO(plain_header)
+    def __init__(self, path: str, header: Header, elements: tuple[Element, ...]) -> None:
+        super().__init__(io.FileIO(path))
+        self._pending = io.BytesIO(_plain_header(header, elements))
         self._is_text = header.encoding == "ascii"
-        self._size = file.seek(0, io.SEEK_END)
-        file.seek(header.data_offset)
+        self._size = self.seek(0, io.SEEK_END)
+        self.seek(header.data_offset)
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is None or size < 0:  # from a damaged list
@@ -241,26 +240,11 @@ class _CleanStream(io.BufferedIOBase):
         data = self._pending.read(size)
         if data or size == 0:
             return data
-        data = self._file.read(min(size, self._size - self._file.tell()))
+        data = super().read(min(size, self._size - self.tell()))
         return data.translate(_NOT_ASCII) if self._is_text else data
 
     def read1(self, size: int = -1, /) -> bytes:
         return self.read(size)
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._file.tell()
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        return self._file.seek(offset, whence)
-
-    def fileno(self) -> int:
-        return self._file.fileno()  # for memory mapping
 
 
 def _explain(error: Any, elements: tuple[Element, ...], path: str) -> str:

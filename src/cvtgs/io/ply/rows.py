@@ -49,43 +49,21 @@ class PlyRows:
         return np.dtype(list(self.names))
 
     def read(self, start: int, stop: int, step: int = 1) -> NDArray[Any]:
-        """Map a range of rows into memory.
-
-        Args:
-            start: First row.
-            stop: Row after the last one.
-            step: Stride between rows.
-
-        Returns:
-            A structured array; pages are read on use.
-        """
+        """Map every ``step``-th row of a range into memory; pages are read on use."""
         place = self.offset + start * self.dtype.itemsize
         rows = np.memmap(self.path, self.dtype, "r", place, (stop - start,)).view(np.ndarray)
         return rows[::step]
 
     def scene(self, rows: NDArray[Any]) -> GaussianScene:
-        """Build a scene from rows.
-
-        Args:
-            rows: Structured array with at least the columns of the file.
-
-        Returns:
-            A scene as :func:`cvtgs.load` returns it.
-        """
+        """Build a scene from rows with at least the columns of the file, as a load returns it."""
         return self.assemble([rows], len(rows))
 
     def assemble(
         self, parts: Iterable[NDArray[Any]], count: int, *, is_slim: bool = False
     ) -> GaussianScene:
-        """Build a scene from rows in several parts.
+        """Build a scene from ``count`` rows in several parts, as :func:`cvtgs.load` returns it.
 
-        Args:
-            parts: Structured arrays with at least the columns of the file.
-            count: Total number of rows.
-            is_slim: Whether SH bands above the constant one and extra columns are left out.
-
-        Returns:
-            A scene as :func:`cvtgs.load` returns it.
+        A slim one lacks extra columns and SH bands above the constant one.
         """
         degree = 0 if is_slim else self.sh_degree
         scene = assemble(
@@ -96,9 +74,8 @@ class PlyRows:
             sh_degree=degree,
             with_extras=not is_slim,
         )
-        return change_axes(
-            scene if degree is None else scene.with_sh_degree(degree), self.axes, SCENE_AXES
-        )
+        scene = scene if degree is None else scene.with_sh_degree(degree)
+        return change_axes(scene, self.axes, SCENE_AXES)
 
 
 def open_rows(

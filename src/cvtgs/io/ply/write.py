@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError, warn
 from cvtgs.io.ply.header import FLOAT_TYPES, SCALARS, Layout, header_bytes, row_dtype
-from cvtgs.io.ply.properties import dtype_of, is_standard, rest_index, standard_slots
+from cvtgs.io.ply.properties import dtype_of, is_standard, standard_slots
 from cvtgs.scene import FLAT_LOG_SCALE, NORMALS, GaussianScene
 
 CHUNK_BYTES = 1 << 20
@@ -102,11 +102,7 @@ def _output_layout(scene: GaussianScene) -> Layout:
             kept.append((name, kind))
     names = {name for name, _ in kept}
     missing = [(name, float_type) for name in slots if name not in names]
-    colours = [
-        i
-        for i, (name, _) in enumerate(kept)
-        if name.startswith("f_dc_") or rest_index(name) is not None
-    ]
+    colours = [i for i, (name, _) in enumerate(kept) if name.startswith(("f_dc_", "f_rest_"))]
     end = max(colours, default=len(kept) - 1) + 1  # view-dependent colours follow these
     added = [
         (name, _extra_type(name, column, None))
@@ -156,8 +152,7 @@ def _extra_type(name: str, column: Tensor, kind: str | None) -> str:
 
 def _fits(column: Tensor, kind: str) -> bool:
     """Check the range where the torch dtype is wider than the PLY type."""
-    if kind in FLOAT_TYPES or (kind not in ("ushort", "uint") and column.dtype != torch.int64):
+    if kind in FLOAT_TYPES:
         return True
-    bits = 16 if kind == "ushort" else 32
-    low, high = (-(2**31), 2**31 - 1) if kind == "int" else (0, 2**bits - 1)
-    return bool(((column >= low) & (column <= high)).all())
+    limits = np.iinfo(SCALARS[kind].code)
+    return bool(((column >= limits.min) & (column <= limits.max)).all())
