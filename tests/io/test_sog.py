@@ -271,7 +271,8 @@ DAMAGED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "files": (lambda m: m["sh0"].update(files=[]), "'files' must be 1 file name, found []."),
     "folder": (
         lambda m: m["sh0"].update(files=["../sh0.webp"]),
-        "the files of a SOG must have names without folders, found '../sh0.webp'.",
+        "the files of a SOG must have names of at most 255 characters without folders, found "
+        "'../sh0.webp'.",
     ),
     "no image": (
         lambda m: m["sh0"].update(files=["meta.json"]),
@@ -361,7 +362,10 @@ def test_random_damage_is_a_scene_or_a_cvtgs_error(
 def test_file_names_with_odd_characters_or_folders_are_refused(tmp_path: Path, name: str) -> None:
     path = changed(tmp_path, lambda meta: meta["quats"].update(files=[name]))
     text = refusal(path)
-    assert "the files of a SOG must have names without folders, found" in text
+    assert (
+        "the files of a SOG must have names of at most 255 characters without folders, found"
+        in text
+    )
     assert text.isprintable()
     assert len(text) < 200 + len(str(path))
 

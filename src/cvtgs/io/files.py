@@ -36,8 +36,8 @@ MOST_EXPANSION = 64
 """Beyond that, a scene may take this many times the bytes of its file; real ones take 4 to 13."""
 LONGEST_NAME = 255
 """Characters that file systems allow in a name."""
-_FLOATS = 14
-"""Numbers of a Gaussian without view-dependent SH coefficients."""
+_FLOATS = 11
+"""Numbers of a Gaussian without SH coefficients."""
 _MOST_WHOLE = 1 << 53
 """Whole numbers up to here are the same in every JSON parser."""
 
@@ -164,13 +164,13 @@ def _numbered(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
     return [part for _, part in sorted(numbers, reverse=True)]
 
 
-def check_expansion(path: Path | str, *, count: int, rest: int, stored: int) -> None:
+def check_expansion(path: Path | str, *, count: int, sh_degree: int, stored: int) -> None:
     """Refuse a file that claims far more Gaussians than it can hold.
 
-    ``rest`` counts the view-dependent SH coefficients per channel. Every reader of a compressed
-    format calls this before it decompresses the Gaussians, unless sizes are trusted.
+    Every reader of a compressed format calls this before it decompresses the Gaussians, unless
+    sizes are trusted.
     """
-    wanted = 4 * count * (_FLOATS + 3 * rest)
+    wanted = 4 * count * (_FLOATS + 3 * (sh_degree + 1) ** 2)
     if wanted > FREE_BYTES + MOST_EXPANSION * stored:
         raise FileFormatError(
             f"{path}: a scene must take at most {FREE_BYTES >> 20} MiB plus {MOST_EXPANSION} times "

@@ -106,7 +106,9 @@ class _View(Document):
     byteStride: Size | None = None  # noqa: N815
 
 
-class _Accessor(Document):
+class Accessor(Document):
+    """Where the numbers of an attribute are, and their types."""
+
     bufferView: Size | None = None  # noqa: N815
     byteOffset: Size = 0  # noqa: N815
     componentType: Whole  # noqa: N815
@@ -151,13 +153,9 @@ class GltfFile:
             )
         return memoryview(content)[view.byteOffset : end], view.byteStride
 
-    def count(self, accessor: int) -> int:
-        """Return the number of elements that an accessor states."""
-        return self.entry(_Accessor, "accessors", accessor).count
-
     def values(self, index: int, kind: str, name: str) -> NDArray[np.float32]:
         """Return the numbers of an accessor as float32, one row per element."""
-        accessor = self.entry(_Accessor, "accessors", index)
+        accessor = self.entry(Accessor, "accessors", index)
         where = f"accessors[{index}] ({name})"
         component = accessor.componentType
         integers, encodings = _ENCODINGS.get(name, (frozenset(), "floats"))

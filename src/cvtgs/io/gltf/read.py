@@ -36,6 +36,7 @@ from cvtgs.io.gltf.document import (
     SCALE,
     SPLATS,
     SPZ,
+    Accessor,
     Entries,
     Entry,
     GltfFile,
@@ -186,12 +187,13 @@ def _local_matrix(node: _Node) -> Matrix:
 
 def _check_sizes(file: GltfFile, placed: list[_Placed]) -> None:
     """Refuse nodes that repeat the same bytes too often; SPZ inside is checked separately."""
-    total = rest = 0
-    for one in placed:
-        if POSITION in one.primitive.attributes:
-            total += file.count(_index(file, one, POSITION))
-        rest = max(rest, REST_COUNTS[_degree(file, one)])
-    check_expansion(file.path, count=total, rest=rest, stored=file.stored)
+    counts = [
+        file.entry(Accessor, "accessors", _index(file, one, POSITION)).count
+        for one in placed
+        if POSITION in one.primitive.attributes
+    ]
+    degree = max(_degree(file, one) for one in placed)
+    check_expansion(file.path, count=sum(counts), sh_degree=degree, stored=file.stored)
 
 
 def _read_primitive(file: GltfFile, one: _Placed, *, trust_sizes: bool) -> GaussianScene:

@@ -108,14 +108,10 @@ def _damage_named(text: str) -> Iterator[None]:
 
 
 def _check_name(name: str, path: Path) -> None:
-    if PurePosixPath(name).name != name or not is_within(name):
+    if PurePosixPath(name).name != name or not is_within(name) or len(name) > LONGEST_NAME:
         raise FileFormatError(
-            f"{path}: the files of a SOG must have names without folders, found {shown(name)}."
-        )
-    if len(name) > LONGEST_NAME:
-        raise FileFormatError(
-            f"{path}: the files of a SOG must have names of at most {LONGEST_NAME} characters, "
-            f"found {shown(name)}."
+            f"{path}: the files of a SOG must have names of at most {LONGEST_NAME} characters "
+            f"without folders, found {shown(name)}."
         )
 
 

@@ -98,15 +98,9 @@ class _Version2(_Root):
     shN: _Palette | None = None  # noqa: N815 (the name in the file)
 
 
-def _starts_with_count(shape: list[Any]) -> list[Any]:
-    if not shape or not isinstance(shape[0], int):
-        raise ValueError
-    return shape
-
-
 class _ShapedMeans(_Means):
-    shape: Annotated[list[Any], AfterValidator(_starts_with_count)] = Field(
-        description="a list that starts with the number of Gaussians"
+    shape: list[Whole] = Field(
+        min_length=1, description="a list that starts with the number of Gaussians"
     )
 
 
@@ -189,19 +183,16 @@ def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
 
 
 def _check_expansion(meta: _Meta, stored: StoredBytes, path: Path) -> None:
-    document = meta.document
-    parts = (document.means, document.scales, document.quats, document.sh0, document.shN)
+    document, rest = meta.document, meta.document.shN
+    parts = (document.means, document.scales, document.quats, document.sh0, rest)
     names = {name for part in parts if part is not None for name in part.files}
-    bands = document.shN.bands if isinstance(document.shN, _Palette) else 3
-    rest = 0 if document.shN is None else REST_COUNTS[bands]
-    check_expansion(path, count=meta.count, rest=rest, stored=stored(sorted(names)))
+    degree = 0 if rest is None else rest.bands if isinstance(rest, _Palette) else 3
+    check_expansion(path, count=meta.count, sh_degree=degree, stored=stored(sorted(names)))
 
 
 def _read_meta(content: Any, where: str) -> _Meta:
-    version = validated(_Root, content, where).version or 1
-    meta = (
-        _meta_of_version_1(content, where) if version == 1 else _meta_of_version_2(content, where)
-    )
+    is_first = (validated(_Root, content, where).version or 1) == 1
+    meta = (_meta_of_version_1 if is_first else _meta_of_version_2)(content, where)
     if not 0 < meta.count <= _MOST_COUNT:
         raise FileFormatError(
             f"{where}: a SOG must hold 1 to {_MOST_COUNT:,} Gaussians, found {meta.count:,}."

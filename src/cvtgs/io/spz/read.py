@@ -4,7 +4,6 @@ import struct
 import zlib
 from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -37,12 +36,9 @@ STORED_REST_COUNTS = (0, 3, 8, 15, 24)
 Blocks = dict[str, UInt8[np.ndarray, "b"]]
 """Bytes by name: means, opacities, colors, log_scales, quats, sh."""
 
-_GZIP = b"\x1f\x8b"
+_GZIP, _START = b"\x1f\x8b", MAGIC.to_bytes(4, "little")
 
 _MOST_BITS = 24
-
-_MOST_EXPANSION = 1032
-"""Deflate cannot expand one byte to more than this many."""
 
 _TABLE_START = slice(16, 20)
 
@@ -62,11 +58,6 @@ class SpzHeader:
     """Number of compressed blocks of version 4; reserved in older versions."""
 
     @property
-    def antialiased(self) -> bool:
-        """Whether the scene was trained with anti-aliasing."""
-        return bool(self.flags & ANTIALIASED_FLAG)
-
-    @property
     def sizes(self) -> dict[str, int]:
         """Bytes of each block, in the order of the file."""
         per_row = {
@@ -82,14 +73,6 @@ class SpzHeader:
     def packed(self) -> bytes:
         """Return the first 16 bytes of the file."""
         return HEADER.pack(MAGIC, *astuple(self))
-
-
-class _Content(NamedTuple):
-    """The content of a file; axes only if it states them."""
-
-    header: SpzHeader
-    blocks: Blocks
-    axes: str | None = None
 
 
 def read_spz(path: Path, *, axes: str | None = None, trust_sizes: bool = False) -> GaussianScene:
@@ -122,24 +105,25 @@ def decode_spz(
     content: bytes, path: Path | str, *, axes: str | None = None, trust_sizes: bool = False
 ) -> GaussianScene:
     """Decode the bytes of an ``.spz`` file as :func:`read_spz` does."""
-    if content[:2] == _GZIP:
-        found = _read_gzip(content, path, trust_sizes=trust_sizes)
-    elif content[:4] == MAGIC.to_bytes(4, "little"):
-        found = _read_version_4(content, path, trust_sizes=trust_sizes)
+    if content.startswith(_GZIP):
+        header, blocks = _read_gzip(content, path, trust_sizes=trust_sizes)
+        stated = None
+    elif content.startswith(_START):
+        header, blocks, stated = _read_version_4(content, path, trust_sizes=trust_sizes)
     else:
         raise FileFormatError(
             f"{path}: an .spz file must start with the magic number of gzip or SPZ, "
             f"found {content[:4]!r}."
         )
-    header, blocks = found.header, found.blocks
     if header.sh_degree > 3:
         warn(
             f"{path}: left out the SH bands above degree 3 (the file has degree "
             f"{header.sh_degree}), since a scene holds degree 0 to 3.",
             DroppedDataWarning,
         )
-    scene = scene_of(_unpack(header, blocks), antialiased=header.antialiased)
-    return change_axes(scene, axes or found.axes or SCENE_AXES, SCENE_AXES)
+    antialiased = bool(header.flags & ANTIALIASED_FLAG)
+    scene = scene_of(_unpack(header, blocks), antialiased=antialiased)
+    return change_axes(scene, axes or stated or SCENE_AXES, SCENE_AXES)
 
 
 def _unpack(header: SpzHeader, blocks: Blocks) -> Arrays:
@@ -178,13 +162,11 @@ def _quats(stored: UInt8[np.ndarray, "n b"]) -> Float[np.ndarray, "n 4"]:
     return np.roll(restore_largest((words >> 30).astype(np.int64), others), 1, axis=1)
 
 
-def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Content:
+def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> tuple[SpzHeader, Blocks]:
     stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     try:
         header = _header(stream.decompress(content, HEADER.size), path, versions=(1, 2, 3))
         wanted = sum(header.sizes.values())
-        if wanted > _MOST_EXPANSION * len(content):
-            raise _too_short(path, header, wanted, f"{len(content):,} compressed bytes")
         if not trust_sizes:
             _check_expansion(path, header, len(content))
         payload = stream.decompress(stream.unconsumed_tail, wanted)
@@ -194,7 +176,10 @@ def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Conte
             f"{path}: must be intact gzip data, found damage: {error}."
         ) from error
     if len(payload) < wanted:
-        raise _too_short(path, header, wanted, f"{len(payload):,}")
+        raise FileFormatError(
+            f"{path}: must hold {wanted:,} bytes for the {header.count:,} Gaussians of SH degree "
+            f"{header.sh_degree} that the header promises, found {len(payload):,}."
+        )
     if surplus and header.flags & EXTENSIONS_FLAG:  # their end is not recorded
         raise FileFormatError(
             f"{path}: an .spz file of version {header.version} must have no extensions, found "
@@ -210,10 +195,13 @@ def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Conte
         raise FileFormatError(f"{path}: must be intact gzip data, found it cut short.")
     ends = np.cumsum(list(header.sizes.values()), dtype=np.int64)[:-1]
     blocks = np.split(np.frombuffer(payload, np.uint8), ends)
-    return _Content(header, dict(zip(header.sizes, blocks, strict=True)))
+    return header, dict(zip(header.sizes, blocks, strict=True))
 
 
-def _read_version_4(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Content:
+def _read_version_4(
+    content: bytes, path: Path | str, *, trust_sizes: bool
+) -> tuple[SpzHeader, Blocks, str | None]:
+    """Return the header, the blocks, and the axes if the file states them."""
     header = _header(content[: HEADER.size], path, versions=(4,))
     sizes = {name: size for name, size in header.sizes.items() if size}
     start = int.from_bytes(content[_TABLE_START], "little")
@@ -239,7 +227,7 @@ def _read_version_4(content: bytes, path: Path | str, *, trust_sizes: bool) -> _
         blocks[name] = _unzstd(content[at : at + packed], size, f"{path}: block {name!r}")
         at += packed
     extensions = content[FOURTH_HEADER_BYTES:start] if header.flags & EXTENSIONS_FLAG else b""
-    return _Content(header, blocks, _stated_axes(extensions, path))
+    return header, blocks, _stated_axes(extensions, path)
 
 
 def _stated_axes(extensions: bytes, path: Path | str) -> str | None:
@@ -260,22 +248,17 @@ def _stated_axes(extensions: bytes, path: Path | str) -> str | None:
 
 
 def _check_expansion(path: Path | str, header: SpzHeader, stored: int) -> None:
-    rest = STORED_REST_COUNTS[header.sh_degree]
-    check_expansion(path, count=header.count, rest=rest, stored=stored)
+    check_expansion(path, count=header.count, sh_degree=header.sh_degree, stored=stored)
 
 
 def _header(start: bytes, path: Path | str, *, versions: tuple[int, ...]) -> SpzHeader:
-    if len(start) < HEADER.size:
+    if len(start) < HEADER.size or not start.startswith(_START):
         raise FileFormatError(
-            f"{path}: an .spz file must start with a header of {HEADER.size} bytes, "
-            f"found {len(start)}."
+            f"{path}: an .spz file must start with a header of {HEADER.size} bytes that begin "
+            f"with {_START!r}, found {len(start)} that begin with {start[:4]!r}."
         )
-    magic, *fields = HEADER.unpack(start)
+    _, *fields = HEADER.unpack(start)
     header = SpzHeader(*fields)
-    if magic != MAGIC:
-        raise FileFormatError(
-            f"{path}: the header of an .spz file must start with b'NGSP', found {start[:4]!r}."
-        )
     if header.version not in versions:
         raise FileFormatError(
             f"{path}: the version of the .spz file must be 1 to 3, or 4 without gzip, "
@@ -288,13 +271,6 @@ def _header(start: bytes, path: Path | str, *, versions: tuple[int, ...]) -> Spz
             f"most {_MOST_BITS} fractional bits, found {count:,} of degree {degree} with {bits}."
         )
     return header
-
-
-def _too_short(path: Path | str, header: SpzHeader, wanted: int, found: str) -> FileFormatError:
-    return FileFormatError(
-        f"{path}: must hold {wanted:,} bytes for the {header.count:,} Gaussians of SH degree "
-        f"{header.sh_degree} that the header promises, found {found}."
-    )
 
 
 def _unzstd(content: bytes, size: int, where: str) -> UInt8[np.ndarray, "b"]:
