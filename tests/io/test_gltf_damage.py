@@ -113,7 +113,7 @@ DAMAGE: dict[str, tuple[Change, str]] = {
     ),
     "node by name": (
         lambda d: d.update(nodes=[{"children": ["base"]}]),
-        "nodes must be listed by number, found 'base'.",
+        "nodes[0]: 'children' must be a list of whole numbers of at least 0, found ['base'].",
     ),
     "skewed": (
         lambda d: d.update(nodes=[{"mesh": 0, "scale": [1, 2, 1]}]),

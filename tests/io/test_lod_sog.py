@@ -123,20 +123,23 @@ def rows(document: dict[str, Any], chunk: int = 0, level: str = "0") -> dict[str
     return document["tree"]["children"][chunk]["lods"][level]
 
 
-OUTSIDE = "the files of a stream must be in its folder, found "
+OUTSIDE = "the files of a stream must be meta.json or .sog in its folder, found "
 DAMAGE: dict[str, tuple[Change, str]] = {
     "version": (lambda d: d.update(version=2), "'version' must be 1, found 2."),
     "levels": (lambda d: d.update(lodLevels=0), "'lodLevels' must be 1 or more, found 0."),
     "tree": (lambda d: d.update(tree=[]), "'tree' must be a JSON object, found []."),
     "node": (
         lambda d: d["tree"].update(children=[7]),
-        "a node must be a JSON object, found 7.",
+        "a node: must be a JSON object, found 7.",
     ),
     "children": (
         lambda d: d["tree"].update(children="many"),
-        "'children' must be a list, found 'many'.",
+        "a node: 'children' must be a list, found 'many'.",
     ),
-    "lods": (lambda d: d.update(tree={"lods": 3}), "'lods' must be a JSON object, found 3."),
+    "lods": (
+        lambda d: d.update(tree={"lods": 3}),
+        "a node: 'lods' must be a JSON object, found 3.",
+    ),
     "level": (
         lambda d: d.update(tree={"lods": {"fine": {}}}),
         "chunk 0: levels must be whole numbers, found 'fine'.",
@@ -172,7 +175,7 @@ DAMAGE: dict[str, tuple[Change, str]] = {
     ),
     "foreign": (
         lambda d: d["filenames"].__setitem__(0, "0_0/scene.ply"),
-        "the files of a stream must be meta.json or .sog, found '0_0/scene.ply'.",
+        f"{OUTSIDE}'0_0/scene.ply'.",
     ),
     "nothing": (
         lambda d: (d.pop("environment"), d.update(tree={}, counts=[0, 0])),

@@ -68,7 +68,8 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
             raise _refusal(path, "be a file", "a loop of symbolic links")
         if target.is_dir() or os.fspath(path).endswith(("/", os.sep)):
             raise _refusal(path, "be a file", "a directory")
-        if (target.exists() and not target.is_file()) or _is_device(path):
+        # a path such as /dev/stdout leads to a pipe or a terminal, but its target does not exist
+        if any(one.exists() and not one.is_file() for one in (target, Path(path))):
             raise _refusal(path, "be a regular file", "a device or a pipe")
         if target.exists() and not overwrite:
             raise _exists(path)
@@ -286,15 +287,6 @@ def _exists(path: str | os.PathLike[str]) -> OutputExistsError:
 
 def _refusal(path: str | os.PathLike[str], required: str, found: str) -> OutputError:
     return OutputError(f"{os.fspath(path)}: the output must {required}, found {found}.")
-
-
-def _is_device(path: str | os.PathLike[str]) -> bool:
-    """Return whether a path leads to a pipe or a terminal, as /dev/stdout does."""
-    try:
-        mode = Path(path).stat().st_mode
-    except OSError:
-        return False
-    return stat.S_ISFIFO(mode) or stat.S_ISCHR(mode) or stat.S_ISSOCK(mode)
 
 
 def write_error(path: str | os.PathLike[str], error: OSError) -> OutputError:

@@ -74,15 +74,12 @@ def _scene_tensors(content: Any, path: Path) -> tuple[dict[str, Tensor], bool]:
             tensors = {name: state[prefix + name] for name in _NAMES if prefix + name in state}
             if "means" in tensors:
                 return tensors, "features_dc" in tensors
+    found = ", ".join(shown(name) for name in islice(groups, 5)) or "neither"
+    found += ", ..." if len(groups) > 5 else ""
     raise FileFormatError(
         f"{path}: a checkpoint must hold a scene under 'splats' (gsplat) or "
-        f"'pipeline' (nerfstudio's Splatfacto), found {_keys_of(groups)}."
+        f"'pipeline' (nerfstudio's Splatfacto), found {found}."
     )
-
-
-def _keys_of(groups: Mapping[Any, Any]) -> str:
-    names = [shown(name) for name in islice(groups, 6)]
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "") or "neither"
 
 
 @contextmanager
@@ -147,7 +144,7 @@ def _names_in(path: Path) -> Iterator[str]:
 
 
 class _IgnoredType:
-    """A stand-in for the types of numpy scalars."""
+    """A stand-in for numpy scalars and their types, which builds nothing."""
 
     def __init__(self, *_: Any) -> None:
         pass
@@ -156,28 +153,16 @@ class _IgnoredType:
         pass
 
 
-def _ignored_number(module: str) -> Any:
-    """Build a stand-in for the constructor of numpy scalars, whose module numpy 2 renamed."""
-
-    def scalar(*_: Any) -> float:
-        return 0.0
-
-    scalar.__module__, scalar.__qualname__ = module, "scalar"
-    return scalar
-
-
 @contextmanager
 def _numpy_numbers_ignored() -> Iterator[None]:
     """Let torch's restricted unpickler ignore numpy scalars (learning rates of schedulers).
 
-    It would refuse them. Stand-ins with the same names take their place and build nothing.
+    It would refuse them. Stand-ins with the same names take their place.
     """
-    stand_ins = [
-        _ignored_number("numpy.core.multiarray"),
-        _ignored_number("numpy._core.multiarray"),
-        type("dtype", (_IgnoredType,), {"__module__": "numpy"}),
-        codecs.encode,  # torch 2.6 and later allows it anyway
-    ]
+    names = [("numpy", "dtype")]
+    names += [(f"numpy.{core}.multiarray", "scalar") for core in ("core", "_core")]  # numpy 1 and 2
+    stand_ins: list[Any] = [codecs.encode]  # torch 2.6 and later allows it anyway
+    stand_ins += [type(name, (_IgnoredType,), {"__module__": module}) for module, name in names]
     before = list(torch.serialization.get_safe_globals())
     torch.serialization.add_safe_globals(stand_ins)
     try:

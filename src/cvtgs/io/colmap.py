@@ -38,14 +38,14 @@ class _Image:
 
 
 class _Model(NamedTuple):
-    """A COLMAP camera model that a pinhole camera can replace."""
+    """A COLMAP camera model that a pinhole camera can replace.
+
+    Its number in binary files, and the numbers of its parameters and of focal lengths among them.
+    """
 
     number: int
-    """Its identifier in binary files."""
     parameters: int
-    """Number of parameters: focal lengths, principal point, distortion."""
     focals: int
-    """Number of focal lengths among them, 1 or 2."""
 
 
 _MODELS: Mapping[str, _Model] = {
@@ -57,7 +57,7 @@ _MODELS: Mapping[str, _Model] = {
     "FULL_OPENCV": _Model(number=6, parameters=12, focals=2),
 }
 
-_OTHERS = {
+_NAMES = {model.number: name for name, model in _MODELS.items()} | {
     5: "OPENCV_FISHEYE",
     7: "FOV",
     8: "SIMPLE_RADIAL_FISHEYE",
@@ -81,10 +81,7 @@ def colmap_views(folder: Path) -> list[View]:
         lenses = _cameras_of_txt(folder / "cameras.txt")
         images = _images_of_txt(folder / "images.txt")
         path = folder / "images.txt"
-    return _views(sorted(images, key=lambda image: image.name), lenses, path)
-
-
-def _views(images: Sequence[_Image], lenses: Mapping[int, Lens], path: Path) -> list[View]:
+    images.sort(key=lambda image: image.name)
     for image in images:
         if image.camera not in lenses:
             raise FileFormatError(
@@ -113,12 +110,6 @@ def _checked_image(name: str, camera: int, *, pose: Sequence[float], where: str)
     if not name:
         raise FileFormatError(f"{where}: the image must have a name, found none.")
     return _Image(name=name, camera=camera, quat=tuple(pose[:4]), translation=tuple(pose[4:]))
-
-
-def _model_name(number: int) -> str:
-    """Return the name of a camera model from its identifier in binary files."""
-    names = {model.number: name for name, model in _MODELS.items()} | _OTHERS
-    return names.get(number, f"number {number}")
 
 
 def _find_model(name: str, where: str) -> _Model:
@@ -202,7 +193,7 @@ def _cameras_of_bin(path: Path) -> dict[int, Lens]:
         for row in range(data.count("cameras", least=_CAMERA.size)):
             camera, number, width, height = data.take(_CAMERA, f"camera {row}")
             where = f"{path}: camera {row}"
-            model = _find_model(_model_name(number), where)
+            model = _find_model(_NAMES.get(number, f"number {number}"), where)
             layout = struct.Struct(f"<{model.parameters}d")
             parameters = data.take(layout, f"camera {row}")
             lenses[camera] = _lens_of(model, parameters, width=width, height=height, where=where)

@@ -114,6 +114,11 @@ class _Section(NamedTuple):
     partial_buckets: int
     sh_degree: int
 
+    @property
+    def extra_bytes(self) -> int:
+        """Bytes before the Gaussians."""
+        return 4 * self.partial_buckets + self.bucket_bytes * self.buckets
+
 
 def read_ksplat(path: Path) -> GaussianScene:
     """Read a ``.ksplat`` file.
@@ -150,10 +155,11 @@ def read_ksplat(path: Path) -> GaussianScene:
         degree = max((one.sh_degree for one in sections if one.used), default=0)
         parts = []
         for section in sections:
+            row = _row_type(level, section.sh_degree, path)
+            end = file.tell() + section.extra_bytes + row.itemsize * section.room
             if section.used:
-                parts.append(_read_section(file, section, level, degree, sh_range, path))
-            else:
-                file.seek(_section_bytes(section, level, path), os.SEEK_CUR)
+                parts.append(_read_section(file, section, row, degree, sh_range, path))
+            file.seek(end)
     found = sum(len(part.means) for part in parts)
     if found != count or not count:
         raise FileFormatError(
@@ -177,25 +183,16 @@ def _row_type(level: int, degree: int, path: Path) -> np.dtype[Any]:
     return np.dtype([*fields, ("rgba", "u1", 4), ("sh", sh, _COMPONENTS[degree])])
 
 
-def _section_bytes(section: _Section, level: int, path: Path) -> int:
-    row = _row_type(level, section.sh_degree, path).itemsize
-    extra = 4 * section.partial_buckets + section.bucket_bytes * section.buckets
-    return extra + row * section.room
-
-
 def _read_section(
     file: BinaryIO,
     section: _Section,
-    level: int,
+    row: np.dtype[Any],
     degree: int,
     sh_range: tuple[float, float],
     path: Path,
 ) -> Arrays:
-    row = _row_type(level, section.sh_degree, path)
-    wanted = _section_bytes(section, level, path)
-    here = file.tell()
-    left = os.fstat(file.fileno()).st_size - here
-    needed = wanted - row.itemsize * (section.room - section.used)
+    left = os.fstat(file.fileno()).st_size - file.tell()
+    needed = section.extra_bytes + row.itemsize * section.used
     if section.used > section.room or needed > left:
         raise FileFormatError(
             f"{path}: a section of {section.used:,} Gaussians must take {needed:,} bytes, "
@@ -204,9 +201,8 @@ def _read_section(
     lengths = np.fromfile(file, "<u4", section.partial_buckets).astype(np.int64)
     extra = np.fromfile(file, np.uint8, section.bucket_bytes * section.buckets)
     rows = np.fromfile(file, row, section.used)
-    file.seek(here + wanted)
     means = rows["mean"].astype(np.float32)
-    if level:
+    if rows["mean"].dtype != np.float32:
         bucket = _buckets(section, lengths)[: section.used]
         most = int(bucket.max(initial=0))
         if section.bucket_bytes < 12 or len(bucket) < section.used or most >= section.buckets:
@@ -219,7 +215,7 @@ def _read_section(
         step = np.float32(section.block_size / 2 / middle)
         means = (means - np.float32(middle)) * step + centers[bucket]
     stored = rows["sh"].astype(np.float32)
-    if level == 2:  # bytes
+    if rows["sh"].dtype == np.uint8:
         stored = sh_range[0] + stored / np.float32(255) * np.float32(sh_range[1] - sh_range[0])
     return Arrays(
         means=means,

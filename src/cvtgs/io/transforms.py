@@ -4,7 +4,7 @@ import math
 import struct
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from pydantic import Field
@@ -39,7 +39,6 @@ _PNG_START = struct.Struct(">8sI4sII")
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 _Row = tuple[Number, Number, Number, Number]
-_Given = TypeVar("_Given")
 
 
 class _Intrinsics(Document):
@@ -96,40 +95,27 @@ class _InriaCamera(Document):
     rotation: tuple[Vector, Vector, Vector] = Field(description="3 x 3 finite numbers")
 
 
-_Levels = Sequence[tuple[_Intrinsics, str]]
-"""Intrinsics of a frame, then of the whole file, each with the name of the place in errors."""
-
-
 def inria_views(entries: Sequence[Any], path: Path) -> list[View]:
     """Read the cameras of a ``cameras.json``."""
     views = []
     for row, entry in enumerate(entries):
         where = f"{path}: camera {row}"
         camera = validated(_InriaCamera, entry, where)
+        width, height = camera.width, camera.height
+        cx, cy = width / 2, height / 2
+        lens = Lens(fx=camera.fx, fy=camera.fy, cx=cx, cy=cy, width=width, height=height)
         rotation, position = np.array(camera.rotation), np.array(camera.position)
-        lens = Lens(
-            fx=camera.fx,
-            fy=camera.fy,
-            cx=camera.width / 2,
-            cy=camera.height / 2,
-            width=camera.width,
-            height=camera.height,
-        )
-        views.append(
-            View(
-                name=camera.img_name,
-                viewmat=viewmat_of_pose(rotation, position, where=where),
-                lens=checked_lens(lens, where),
-            )
-        )
+        viewmat = viewmat_of_pose(rotation, position, where=where)
+        views.append(View(name=camera.img_name, viewmat=viewmat, lens=checked_lens(lens, where)))
     return views
 
 
 def transforms_views(content: Any, path: Path, split: Split | None) -> list[View]:
     """Read the frames of a ``transforms.json``."""
     document = validated(_Transforms, content, str(path))
+    shared = validated(_Intrinsics, content, str(path))
     views = [
-        _view(frame, document, path=path, where=f"{path}: frame {row}")
+        _view(frame, shared, path=path, where=f"{path}: frame {row}")
         for row, frame in enumerate(document.frames)
     ]
     if split is None:
@@ -149,7 +135,7 @@ def transforms_views(content: Any, path: Path, split: Split | None) -> list[View
     return hold_out(views, split)
 
 
-def _view(content: Any, document: _Transforms, *, path: Path, where: str) -> View:
+def _view(content: Any, shared: _Intrinsics, *, path: Path, where: str) -> View:
     frame = validated(_Frame, content, where)
     pose = np.array(frame.transform_matrix)
     if len(pose) == 4 and not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
@@ -157,7 +143,7 @@ def _view(content: Any, document: _Transforms, *, path: Path, where: str) -> Vie
             f"{where}: 'transform_matrix' must be a row-major pose with 0 0 0 1 as its last row, "
             f"found {shown(content['transform_matrix'])}."
         )
-    lens = _lens(frame, document, path=path, where=where)
+    lens = _lens(frame, shared, path=path, where=where)
     return View(
         name=frame.file_path,
         viewmat=viewmat_of_pose(pose[:3, :3] @ _OPENGL, pose[:3, 3], where=where),
@@ -165,35 +151,31 @@ def _view(content: Any, document: _Transforms, *, path: Path, where: str) -> Vie
     )
 
 
-def _lens(frame: _Frame, document: _Transforms, *, path: Path, where: str) -> Lens:
+def _lens(frame: _Frame, shared: _Intrinsics, *, path: Path, where: str) -> Lens:
     """Build a lens; each number is from the frame, else the file, else from the image size."""
-    width, height = _size(frame, document, path=path, where=where)
-    levels: _Levels = ((frame, where), (document, str(path)))
+    levels = ((frame, where), (shared, str(path)))
+    frame = frame.model_copy(update={key: v for key, v in shared if getattr(frame, key) is None})
+    width, height = _size(frame, path=path, where=where)
     fx, fy = _focal(levels, "x", pixels=width), _focal(levels, "y", pixels=height)
-    fx, fy = _either(fx, fy), _either(fy, fx)
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None:
         raise FileFormatError(
             f"{where}: 'fl_x', 'fl_y', 'camera_angle_x' or 'camera_angle_y' must be given "
             f"in the frame or at the top level of the file, found none."
         )
-    distortions = (_either(getattr(frame, key), getattr(document, key)) for key in _DISTORTIONS)
-    listed = _either(frame.distortion_params, document.distortion_params) or ()
+    distortions = (getattr(frame, key) for key in _DISTORTIONS)
     return Lens(
         fx=fx,
         fy=fy,
-        cx=_either(frame.cx, _either(document.cx, width / 2)),
-        cy=_either(frame.cy, _either(document.cy, height / 2)),
+        cx=width / 2 if frame.cx is None else frame.cx,
+        cy=height / 2 if frame.cy is None else frame.cy,
         width=width,
         height=height,
-        distorted=any(distortions) or any(listed),
+        distorted=any(distortions) or any(frame.distortion_params or ()),
     )
 
 
-def _either(value: _Given | None, other: _Given) -> _Given:
-    return other if value is None else value
-
-
-def _focal(levels: _Levels, axis: str, *, pixels: int) -> float | None:
+def _focal(levels: Sequence[tuple[_Intrinsics, str]], axis: str, *, pixels: int) -> float | None:
     for given, where in levels:
         focal, angle = getattr(given, f"fl_{axis}"), getattr(given, f"camera_angle_{axis}")
         if focal is not None:
@@ -207,10 +189,9 @@ def _focal(levels: _Levels, axis: str, *, pixels: int) -> float | None:
     return None
 
 
-def _size(frame: _Frame, document: _Transforms, *, path: Path, where: str) -> tuple[int, int]:
-    width, height = _either(frame.w, document.w), _either(frame.h, document.h)
-    if width is not None and height is not None:
-        return width, height
+def _size(frame: _Frame, *, path: Path, where: str) -> tuple[int, int]:
+    if frame.w is not None and frame.h is not None:
+        return frame.w, frame.h
     image = path.parent / frame.file_path
     for candidate in (image, Path(f"{image}.png")):
         if is_file(candidate):

@@ -77,6 +77,9 @@ def coefficients(degree: int) -> list[str]:
 
 Entry = Annotated[dict[str, Any], Field(default_factory=dict, description="a JSON object")]
 Entries = Annotated[list[Any], Field(default_factory=list, description="a list")]
+Indices = Annotated[
+    list[Size], Field(default_factory=list, description="a list of whole numbers of at least 0")
+]
 
 
 class GltfRoot(Document):
@@ -133,7 +136,7 @@ class GltfFile:
     def entry(self, model: type[AnyDocument], name: str, index: int) -> AnyDocument:
         """Return a checked entry of a list of the document."""
         entries = getattr(self.root, name)
-        if not 0 <= index < len(entries):
+        if index >= len(entries):
             raise self.error(f"{name} has {len(entries):,} entries, found a reference to {index}")
         return validated(model, entries[index], f"{self.path}: {name}[{index}]")
 
@@ -201,11 +204,8 @@ class GltfFile:
         return numbers
 
     def _buffer(self, index: int) -> bytes:
-        if index not in self._buffers:
-            self._buffers[index] = self._read_buffer(index)
-        return self._buffers[index]
-
-    def _read_buffer(self, index: int) -> bytes:
+        if index in self._buffers:
+            return self._buffers[index]
         buffer = self.entry(_Buffer, "buffers", index)
         content: bytes | None
         if buffer.uri is None:
@@ -220,7 +220,8 @@ class GltfFile:
             raise self.error(
                 f"buffers[{index}] must have {buffer.byteLength:,} bytes, found {len(content):,}"
             )
-        return content[: buffer.byteLength]
+        self._buffers[index] = content[: buffer.byteLength]
+        return self._buffers[index]
 
     def _decoded(self, uri: str, index: int) -> bytes:
         head, _, text = uri.partition(",")

@@ -3,7 +3,7 @@
 import base64
 import io
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, BinaryIO, Final
 
@@ -78,12 +78,7 @@ def write_glb(scene: GaussianScene, file: BinaryIO) -> None:
     attributes, count = _attributes(arrays), len(arrays.means)
     document = _document(scene, arrays, attributes)
     size = count * sum(one.row_bytes for one in attributes)
-    document["buffers"] = [{"byteLength": size}]
-    _start_glb(file, document, size)
-    for attribute in attributes:
-        for part in attribute.parts(count):
-            file.write(part)
-    file.write(bytes(-size % 4))
+    _write_chunks(file, document, size, (part for one in attributes for part in one.parts(count)))
 
 
 def write_gltf(scene: GaussianScene, file: BinaryIO) -> None:
@@ -112,10 +107,7 @@ def write_spz_glb(scene: GaussianScene, file: BinaryIO) -> None:
     left_out = (OPACITY, *coefficients(0))
     attributes = [one for one in _attributes(arrays) if one.name not in left_out]
     document = _document(scene, arrays, attributes, compressed=len(content))
-    document["buffers"] = [{"byteLength": len(content)}]
-    _start_glb(file, document, len(content))
-    file.write(content)
-    file.write(bytes(-len(content) % 4))
+    _write_chunks(file, document, len(content), [content])
 
 
 def _attributes(arrays: Arrays) -> list[_Attribute]:
@@ -199,9 +191,11 @@ def _json(document: dict[str, Any]) -> bytes:
     return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
 
 
-def _start_glb(file: BinaryIO, document: dict[str, Any], size: int) -> None:
-    """Write the header and JSON of a ``.glb``, and the start of its binary chunk."""
-    text = _json(document)
+def _write_chunks(
+    file: BinaryIO, document: dict[str, Any], size: int, parts: Iterable[bytes]
+) -> None:
+    """Write a ``.glb`` with one buffer, given its size in bytes and its parts."""
+    text = _json({**document, "buffers": [{"byteLength": size}]})
     text += b" " * (-len(text) % 4)
     padded = size + -size % 4
     length = HEADER.size + 2 * CHUNK.size + len(text) + padded
@@ -213,3 +207,6 @@ def _start_glb(file: BinaryIO, document: dict[str, Any], size: int) -> None:
     file.write(HEADER.pack(MAGIC, VERSION, length))
     file.write(CHUNK.pack(len(text), JSON_CHUNK) + text)
     file.write(CHUNK.pack(padded, BINARY_CHUNK))
+    for part in parts:
+        file.write(part)
+    file.write(bytes(padded - size))

@@ -3,14 +3,14 @@
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import torch
 from pydantic import Field
 
 from cvtgs.edit import merge
 from cvtgs.errors import FileFormatError, InvalidArgumentError
-from cvtgs.io.files import Document, Size, Text, Whole, is_within, read_json, validated
+from cvtgs.io.files import Document, Items, Size, Text, Whole, is_within, read_json, validated
 from cvtgs.io.sog.container import META
 from cvtgs.io.sog.read import read_sog
 from cvtgs.scene import GaussianScene
@@ -32,9 +32,9 @@ class _Rows(Document):
     count: Size
 
 
-class _Range(NamedTuple):
-    start: int
-    end: int
+class _LodNode(Document):
+    lods: Annotated[dict[str, Any], Field(description="a JSON object")] | None = None
+    children: Items = Field(default_factory=list)
 
 
 def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> GaussianScene:
@@ -65,10 +65,10 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
     stated = None if meta.counts is None else meta.counts[lod : lod + 1]
     found = sum(rows.count for rows in own)
     complete = len(own) == len(places) or (found > 0 and stated == [found])
-    ranges: dict[int, list[_Range]] = {}
+    ranges: dict[int, list[range]] = {}
     for rows in own if complete else [rows for _, rows in places]:
         if rows.count:
-            part = _Range(rows.offset, rows.offset + rows.count)
+            part = range(rows.offset, rows.offset + rows.count)
             ranges.setdefault(rows.file, []).append(part)
     _check_count(meta, ranges, lod if complete else None, path)
     names = [(meta.filenames[number], parts) for number, parts in sorted(ranges.items())]
@@ -102,20 +102,11 @@ def _chunks(tree: dict[str, Any], path: Path) -> Iterator[dict[str, Any]]:
     """Yield the levels of every leaf of the tree."""
     waiting: list[Any] = [tree]
     while waiting:
-        node = waiting.pop()
-        if not isinstance(node, dict):
-            raise FileFormatError(f"{path}: a node must be a JSON object, found {shown(node)}.")
-        levels, children = node.get("lods"), node.get("children", [])
-        if levels is not None:
-            if not isinstance(levels, dict):
-                raise FileFormatError(
-                    f"{path}: 'lods' must be a JSON object, found {shown(levels)}."
-                )
-            yield levels
-        elif isinstance(children, list):
-            waiting += reversed(children)
+        node = validated(_LodNode, waiting.pop(), f"{path}: a node")
+        if node.lods is not None:
+            yield node.lods
         else:
-            raise FileFormatError(f"{path}: 'children' must be a list, found {shown(children)}.")
+            waiting += reversed(node.children)
 
 
 def _level_of(levels: dict[str, Any], lod: int, where: str) -> int | None:
@@ -128,20 +119,20 @@ def _level_of(levels: dict[str, Any], lod: int, where: str) -> int | None:
 
 
 def _check_count(
-    meta: _LodMeta, ranges: dict[int, list[_Range]], lod: int | None, path: Path
+    meta: _LodMeta, ranges: dict[int, list[range]], lod: int | None, path: Path
 ) -> None:
     """Refuse rows that are in two chunks, and a total other than the file states."""
     for number, parts in ranges.items():
-        parts.sort()
+        parts.sort(key=lambda part: part.start)
         for before, after in pairwise(parts):
-            if after.start < before.end:
+            if after.start < before.stop:
                 raise FileFormatError(
                     f"{path}: each row of a file must be in one chunk, found row {after.start:,} "
                     f"of {shown(meta.filenames[number])} in two."
                 )
     if meta.counts is None or lod is None:
         return
-    total = sum(part.end - part.start for parts in ranges.values() for part in parts)
+    total = sum(len(part) for parts in ranges.values() for part in parts)
     if len(meta.counts) != meta.lodLevels or meta.counts[lod] != total:
         raise FileFormatError(
             f"{path}: 'counts' must hold the number of Gaussians of each of {meta.lodLevels} "
@@ -152,27 +143,23 @@ def _check_count(
 def _inside(path: Path, name: str) -> Path:
     """Return the path of a SOG of the stream, which must be in its folder."""
     pure = PurePosixPath(name)
-    if not is_within(name):
+    if not is_within(name) or (pure.name != META and pure.suffix != ".sog"):
         raise FileFormatError(
-            f"{path}: the files of a stream must be in its folder, found {shown(name)}."
-        )
-    if pure.name != META and pure.suffix != ".sog":
-        raise FileFormatError(
-            f"{path}: the files of a stream must be {META} or .sog, found {shown(name)}."
+            f"{path}: the files of a stream must be {META} or .sog in its folder, found "
+            f"{shown(name)}."
         )
     return path.parent / pure
 
 
-def _read_rows(source: Path, parts: Sequence[_Range], *, trust_sizes: bool) -> GaussianScene:
+def _read_rows(source: Path, parts: Sequence[range], *, trust_sizes: bool) -> GaussianScene:
     """Read ranges of rows of a SOG, in ascending order; all rows if no range is given."""
     scene = read_sog(source, trust_sizes=trust_sizes)
-    if parts and parts[-1].end > len(scene):
+    if parts and parts[-1].stop > len(scene):
         raise FileFormatError(
-            f"{source}: must have the {parts[-1].end:,} Gaussians that the stream reads from it, "
+            f"{source}: must have the {parts[-1].stop:,} Gaussians that the stream reads from it, "
             f"found {len(scene):,}."
         )
-    if not parts or sum(part.end - part.start for part in parts) == len(scene):
+    if not parts or sum(map(len, parts)) == len(scene):
         return scene
-    return scene.select(
-        torch.cat([torch.arange(part.start, part.end, device="cpu") for part in parts])
-    )
+    rows = [torch.arange(part.start, part.stop, device="cpu") for part in parts]
+    return scene.select(torch.cat(rows))
