@@ -201,12 +201,16 @@ def test_damage_of_inria_cameras_is_one_sentence(case, tmp_path) -> None:
 
 
 JSON: Mapping[str, tuple[bytes, str]] = {
-    "empty": (b"", "must be JSON, found an error in line 1, column 1: expecting value."),
+    "empty": (b"", "must be JSON in UTF-8, found: Expecting value: line 1 column 1 (char 0)."),
     "cut": (
         b'{"w": 3,\n "frames": [',
-        "must be JSON, found an error in line 2, column 13: expecting value.",
+        "must be JSON in UTF-8, found: Expecting value: line 2 column 13 (char 21).",
     ),
-    "latin 1": (b'["\xe4"]', "must be JSON in UTF-8, found an invalid byte at 2."),
+    "latin 1": (
+        b'["\xe4"]',
+        "must be JSON in UTF-8, found: 'utf-8' codec can't decode byte 0xe4 in position 2: invalid "
+        "continuation byte.",
+    ),
     "other object": (
         b'{"w": 3}',
         "must be a list of cameras (INRIA's cameras.json) or an object with 'frames' "
@@ -233,4 +237,4 @@ def test_nested_json_and_huge_numbers_are_refused(tmp_path) -> None:
     path = tmp_path / "cameras.json"
     for data in (b"[" * 1_000_000, b"[" + b"9" * 10_000 + b"]"):
         path.write_bytes(data)
-        assert camera_refusal(path).startswith(f"{path}: must be plain JSON, found: ")
+        assert camera_refusal(path).startswith(f"{path}: must be JSON in UTF-8, found: ")

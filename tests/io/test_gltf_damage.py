@@ -195,7 +195,7 @@ def test_damaged_spz_data_inside_a_glb_is_refused(tmp_path: Path) -> None:
 def test_a_scene_that_is_too_large_for_a_glb_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cvtgs.io.gltf.write._MOST_BYTES", 1000)
+    monkeypatch.setattr("cvtgs.io.gltf.document._MOST_BYTES", 1000)
     with pytest.raises(InvalidSceneError, match="must be smaller than 4 GiB, found a scene that"):
         save(storable_scene(9), tmp_path / "a.glb")
     assert list(tmp_path.iterdir()) == []

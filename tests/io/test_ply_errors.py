@@ -81,7 +81,7 @@ HEADER_CASES: Mapping[str, tuple[bytes, str]] = {
     "plywood": (b"plywood", "a PLY file must start with the line 'ply', found b'plywood'."),
     "no end": (
         GOOD[:200],
-        "the PLY header must end with a line 'end_header', found none in the file.",
+        "the PLY header must end with a line 'end_header', found none in the first 200 bytes.",
     ),
     "endless": (
         b"ply\n" + b"comment no end_header here\n" * (MAX_HEADER_BYTES // 20),

@@ -203,12 +203,11 @@ def _read_section(
     rows = np.fromfile(file, row, section.used)
     means = rows["mean"].astype(np.float32)
     if rows["mean"].dtype != np.float32:
-        bucket = _buckets(section, lengths)[: section.used]
-        most = int(bucket.max(initial=0))
-        if section.bucket_bytes < 12 or len(bucket) < section.used or most >= section.buckets:
+        bucket = _buckets(section, lengths)
+        if section.bucket_bytes < 12 or bucket.max() >= section.buckets:
             raise FileFormatError(
-                f"{path}: the buckets of a section must hold its {section.used:,} Gaussians, "
-                f"found {section.buckets:,} buckets of {len(bucket):,}."
+                f"{path}: the {section.buckets:,} buckets of a section must hold its "
+                f"{section.used:,} Gaussians, found other ones."
             )
         centers = extra.reshape(section.buckets, -1)[:, :12].copy().view("<f4")
         middle = section.scale_range or _RANGE
@@ -229,15 +228,11 @@ def _read_section(
 
 def _buckets(section: _Section, lengths: Int[np.ndarray, "p"]) -> Int[np.ndarray, "n"]:
     """Return the bucket of every Gaussian: full buckets first, then those of given lengths."""
-    room = section.used
-    size = min(section.bucket_size, room)  # a damaged header may state four billion
-    full = min(section.full_buckets, room // max(1, size) + 1)
-    first = np.repeat(np.arange(full), size)[:room]
-    clipped = np.minimum(lengths, room)
-    if int(clipped.sum()) > 2 * room:  # a damaged file
-        return first[:0]
-    rest = np.repeat(section.full_buckets + np.arange(len(lengths)), clipped)
-    return np.concatenate([first, rest])
+    full = min(section.full_buckets * section.bucket_size, section.used)
+    first = np.arange(full) // max(1, section.bucket_size)
+    rest = np.searchsorted(np.cumsum(lengths), np.arange(section.used - full), side="right")
+    rest[rest == len(lengths)] = section.buckets  # in none; the file is damaged
+    return np.concatenate([first, section.full_buckets + rest])
 
 
 def _rest(stored: Float[np.ndarray, "n c"], degree: int) -> Float[np.ndarray, "n k 3"]:

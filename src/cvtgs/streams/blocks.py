@@ -13,10 +13,8 @@ from typing import NamedTuple
 from jaxtyping import Int
 from torch import Tensor
 
-from cvtgs.analysis import SceneAnalysis
 from cvtgs.analysis.analyze import select_columns
 from cvtgs.clock import StageClock
-from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, target_count
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn
@@ -26,7 +24,6 @@ from cvtgs.io.atomic import make_folder
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
-from cvtgs.mergenet import Net
 from cvtgs.outofcore import Workers
 from cvtgs.outofcore.job import Job, job_folder, started
 from cvtgs.outofcore.memory import available_memory, block_count, memory_to_plan, sample_rows
@@ -312,7 +309,14 @@ def write_block(spec: StreamJob, block: int) -> None:
     analysis = analysis_of(scan, rows)
     if spec.sh_degree is not None:
         scene = scene.with_sh_degree(min(spec.sh_degree, scene.sh_degree))
-    levels = reduce_levels(scene, analysis, targets, job.config, net=net)
+    levels: list[BlockLevel] = []
+    clock = StageClock(silent, scene.device)
+    for target in targets:
+        if target >= len(scene):
+            levels.append(BlockLevel(with_finite_opacities(scene), 0.0, None))
+            continue
+        reduced = reduce_scene(scene, analysis, target, job.config, net=net, clock=clock)
+        levels.append(BlockLevel(reduced.scene, *level_facts(scene, analysis, reduced)))
     near = near_rows(levels[-1].scene, scan.frame, spec.environment_radii)
     if spec.axes[0] != spec.axes[1]:
         levels = [level._replace(scene=change_axes(level.scene, *spec.axes)) for level in levels]
@@ -320,23 +324,3 @@ def write_block(spec: StreamJob, block: int) -> None:
     part = spec.form.write_part(plan, spec.folder, part=block, listener=silent)
     with atomic_output(spec.part_path(block), overwrite=True) as file:
         file.write(part.model_dump_json().encode())
-
-
-def reduce_levels(
-    scene: GaussianScene,
-    analysis: SceneAnalysis,
-    targets: Sequence[int],
-    config: SimplifyConfig,
-    *,
-    net: Net | None,
-) -> list[BlockLevel]:
-    """Simplify valid Gaussians to descending sizes."""
-    found: list[BlockLevel] = []
-    clock = StageClock(silent, scene.device)
-    for target in targets:
-        if target >= len(scene):
-            found.append(BlockLevel(with_finite_opacities(scene), 0.0, None))
-            continue
-        reduced = reduce_scene(scene, analysis, target, config, net=net, clock=clock)
-        found.append(BlockLevel(reduced.scene, *level_facts(scene, analysis, reduced)))
-    return found

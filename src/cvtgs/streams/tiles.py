@@ -261,16 +261,12 @@ def _listed(tile: _Tile) -> Iterator[_Tile]:
         yield from _listed(child)
 
 
-def _error(plan: StreamPlan, tile: _Tile) -> float:
-    """Return the geometric error of a tile; finer tiles never have larger errors."""
-    errors = [level.geometric_error for level in plan.levels[: tile.level + 1]]
-    return ERROR_PIXELS * max(errors) if tile.children else 0.0
-
-
 def _entry(plan: StreamPlan, tile: _Tile, names: dict[int, str]) -> dict[str, Any]:
+    # finer tiles never have larger errors
+    error = max(level.geometric_error for level in plan.levels[: tile.level + 1])
     entry: dict[str, Any] = {
         "boundingVolume": {"box": _box(tile.node.box_min, tile.node.box_max)},
-        "geometricError": _error(plan, tile),
+        "geometricError": ERROR_PIXELS * error if tile.children else 0.0,
         "content": {"uri": names[id(tile)]},
     }
     if tile.children:

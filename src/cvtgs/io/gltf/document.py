@@ -1,17 +1,19 @@
 """The parts of a glTF document that splats need: chunks, buffers, accessors and their checks."""
 
 import base64
+import json
 import struct
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any
-from urllib.parse import unquote, urlsplit
+from typing import Annotated, Any, BinaryIO
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from cvtgs.errors import FileFormatError
+from cvtgs.errors import FileFormatError, InvalidSceneError
 from cvtgs.io.files import (
     LONGEST_NAME,
     AnyDocument,
@@ -38,9 +40,10 @@ AXES = "luf"
 POSITION, COLOR = "POSITION", "COLOR_0"
 ROTATION, SCALE, OPACITY = f"{SPLATS}:ROTATION", f"{SPLATS}:SCALE", f"{SPLATS}:OPACITY"
 
-MAGIC, VERSION = b"glTF", 2
-HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
-JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+_MAGIC, _VERSION = b"glTF", 2
+_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
+_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+_MOST_BYTES = 1 << 32
 
 BYTE, UNSIGNED_BYTE, SHORT, UNSIGNED_SHORT, FLOAT = 5120, 5121, 5122, 5123, 5126
 _COMPONENTS: dict[int, np.dtype[Any]] = {
@@ -233,13 +236,8 @@ class GltfFile:
             raise self.error(f"buffers[{index}] must be valid base64, found: {error}") from error
 
     def _beside(self, uri: str, index: int, length: int) -> bytes:
-        try:
-            parts = urlsplit(uri)
-        except ValueError:  # brackets that enclose no address
-            parts = urlsplit("//outside")
-        name = unquote(parts.path)
-        outside = not is_within(name) or len(uri) > LONGEST_NAME  # such as a damaged data URI
-        if parts.scheme or parts.netloc or parts.query or outside:
+        name = unquote(uri)
+        if not is_within(name) or len(uri) > LONGEST_NAME:  # such as a damaged data URI
             raise self.error(
                 f"buffers[{index}] must be in the folder of the file, found {shown(uri)}"
             )
@@ -254,7 +252,7 @@ def open_gltf(path: Path) -> GltfFile:
     with open_input(path) as file:
         content = file.read()
     binary, text = None, content
-    if content[: len(MAGIC)] == MAGIC:
+    if content[: len(_MAGIC)] == _MAGIC:
         text, binary = _chunks(content, path)
     elif path.suffix.lower() == ".glb":
         raise FileFormatError(f"{path}: a .glb must start with b'glTF', found {content[:4]!r}.")
@@ -264,21 +262,21 @@ def open_gltf(path: Path) -> GltfFile:
 
 def _chunks(content: bytes, path: Path) -> tuple[bytes, bytes | None]:
     """Split a ``.glb`` into its JSON chunk and its binary chunk."""
-    if len(content) < HEADER.size:
+    if len(content) < _HEADER.size:
         raise FileFormatError(
-            f"{path}: a .glb must start with a header of {HEADER.size} bytes, found {len(content)}."
+            f"{path}: must start with a header of {_HEADER.size} bytes, found {len(content)}."
         )
-    _, version, length = HEADER.unpack_from(content)
-    if version != VERSION or length > len(content):
+    _, version, length = _HEADER.unpack_from(content)
+    if version != _VERSION or length > len(content):
         raise FileFormatError(
-            f"{path}: must be glTF version {VERSION} with the {length:,} bytes that its "
+            f"{path}: must be glTF version {_VERSION} with the {length:,} bytes that its "
             f"header promises, found version {version} and {len(content):,} bytes."
         )
     found: dict[int, bytes] = {}
-    at = HEADER.size
-    while at + CHUNK.size <= length:
-        size, kind = CHUNK.unpack_from(content, at)
-        at += CHUNK.size
+    at = _HEADER.size
+    while at + _CHUNK.size <= length:
+        size, kind = _CHUNK.unpack_from(content, at)
+        at += _CHUNK.size
         if at + size > length:
             raise FileFormatError(
                 f"{path}: a chunk must end within the {length:,} bytes of the file, found one that "
@@ -286,6 +284,32 @@ def _chunks(content: bytes, path: Path) -> tuple[bytes, bytes | None]:
             )
         found.setdefault(kind, content[at : at + size])
         at += size
-    if JSON_CHUNK not in found:
+    if _JSON_CHUNK not in found:
         raise FileFormatError(f"{path}: a .glb must have a JSON chunk, found none.")
-    return found[JSON_CHUNK], found.get(BINARY_CHUNK)
+    return found[_JSON_CHUNK], found.get(_BINARY_CHUNK)
+
+
+def json_bytes(document: dict[str, Any]) -> bytes:
+    """Return a document as JSON without blanks."""
+    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+
+
+def write_chunks(
+    file: BinaryIO, document: dict[str, Any], size: int, parts: Iterable[bytes]
+) -> None:
+    """Write a ``.glb`` with one buffer, given its size in bytes and its parts."""
+    text = json_bytes({**document, "buffers": [{"byteLength": size}]})
+    text += b" " * (-len(text) % 4)
+    padded = size + -size % 4
+    length = _HEADER.size + 2 * _CHUNK.size + len(text) + padded
+    if length >= _MOST_BYTES:
+        raise InvalidSceneError(
+            f"a .glb must be smaller than 4 GiB, found a scene that takes {length:,} bytes; write "
+            f".spz.glb, or simplify it."
+        )
+    file.write(_HEADER.pack(_MAGIC, _VERSION, length))
+    file.write(_CHUNK.pack(len(text), _JSON_CHUNK) + text)
+    file.write(_CHUNK.pack(padded, _BINARY_CHUNK))
+    for part in parts:
+        file.write(part)
+    file.write(bytes(padded - size))

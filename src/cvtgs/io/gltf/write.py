@@ -2,15 +2,13 @@
 
 import base64
 import io
-import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, BinaryIO, Final
 
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from cvtgs.errors import InvalidSceneError
 from cvtgs.io.arrays import (
     Arrays,
     Bytes,
@@ -22,15 +20,10 @@ from cvtgs.io.arrays import (
     to_bytes,
 )
 from cvtgs.io.gltf.document import (
-    BINARY_CHUNK,
-    CHUNK,
     COLOR,
     COLOR_SPACE,
     FLOAT,
-    HEADER,
-    JSON_CHUNK,
     KERNEL,
-    MAGIC,
     OPACITY,
     POSITION,
     ROTATION,
@@ -38,9 +31,10 @@ from cvtgs.io.gltf.document import (
     SPLATS,
     SPZ,
     UNSIGNED_BYTE,
-    VERSION,
     WIDTHS,
     coefficients,
+    json_bytes,
+    write_chunks,
 )
 from cvtgs.io.spz import write_spz
 from cvtgs.math.spherical_harmonics import degree_of
@@ -48,7 +42,6 @@ from cvtgs.scene import GaussianScene
 
 _CHUNK_ROWS = 1 << 18
 _ARRAY_BUFFER = 34962
-_MOST_BYTES = 1 << 32
 _SPZ_VERSION: Final = 3
 """The newest version that readers of the draft of the extension accept."""
 
@@ -78,7 +71,7 @@ def write_glb(scene: GaussianScene, file: BinaryIO) -> None:
     attributes, count = _attributes(arrays), len(arrays.means)
     document = _document(scene, arrays, attributes)
     size = count * sum(one.row_bytes for one in attributes)
-    _write_chunks(file, document, size, (part for one in attributes for part in one.parts(count)))
+    write_chunks(file, document, size, (part for one in attributes for part in one.parts(count)))
 
 
 def write_gltf(scene: GaussianScene, file: BinaryIO) -> None:
@@ -90,7 +83,7 @@ def write_gltf(scene: GaussianScene, file: BinaryIO) -> None:
     text = base64.b64encode(content).decode()
     uri = f"data:application/octet-stream;base64,{text}"
     document["buffers"] = [{"byteLength": len(content), "uri": uri}]
-    file.write(_json(document))
+    file.write(json_bytes(document))
 
 
 def write_spz_glb(scene: GaussianScene, file: BinaryIO) -> None:
@@ -107,7 +100,7 @@ def write_spz_glb(scene: GaussianScene, file: BinaryIO) -> None:
     left_out = (OPACITY, *coefficients(0))
     attributes = [one for one in _attributes(arrays) if one.name not in left_out]
     document = _document(scene, arrays, attributes, compressed=len(content))
-    _write_chunks(file, document, len(content), [content])
+    write_chunks(file, document, len(content), [content])
 
 
 def _attributes(arrays: Arrays) -> list[_Attribute]:
@@ -144,10 +137,10 @@ def _document(
     compressed: int | None = None,
 ) -> dict[str, Any]:
     """Return the document without buffers; accessors of compressed values have no view."""
-    accessors, views, offset, count = [], [], 0, len(arrays.means)
+    views: list[dict[str, Any]] = []
+    accessors, offset, count = [], 0, len(arrays.means)
     for number, one in enumerate(attributes):
-        accessor: dict[str, Any] = {"componentType": one.component, "count": count}
-        accessor["type"] = one.kind
+        accessor = {"componentType": one.component, "count": count, "type": one.kind}
         if one.component == UNSIGNED_BYTE:
             accessor["normalized"] = True
         if one.name == POSITION:
@@ -156,8 +149,8 @@ def _document(
         if compressed is None:
             accessor["bufferView"] = number
             size = count * one.row_bytes
-            view = {"buffer": 0, "byteOffset": offset, "byteLength": size}
-            views.append(view | {"target": _ARRAY_BUFFER})
+            view = {"buffer": 0, "byteOffset": offset, "byteLength": size, "target": _ARRAY_BUFFER}
+            views.append(view)
             offset += size
         accessors.append(accessor)
     splatting: dict[str, Any] = {"kernel": KERNEL, "colorSpace": COLOR_SPACE}
@@ -185,28 +178,3 @@ def _document(
         "accessors": accessors,
         "bufferViews": views,
     }
-
-
-def _json(document: dict[str, Any]) -> bytes:
-    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-
-
-def _write_chunks(
-    file: BinaryIO, document: dict[str, Any], size: int, parts: Iterable[bytes]
-) -> None:
-    """Write a ``.glb`` with one buffer, given its size in bytes and its parts."""
-    text = _json({**document, "buffers": [{"byteLength": size}]})
-    text += b" " * (-len(text) % 4)
-    padded = size + -size % 4
-    length = HEADER.size + 2 * CHUNK.size + len(text) + padded
-    if length >= _MOST_BYTES:
-        raise InvalidSceneError(
-            f"a .glb must be smaller than 4 GiB, found a scene that takes {length:,} bytes; write "
-            f".spz.glb, or simplify it."
-        )
-    file.write(HEADER.pack(MAGIC, VERSION, length))
-    file.write(CHUNK.pack(len(text), JSON_CHUNK) + text)
-    file.write(CHUNK.pack(padded, BINARY_CHUNK))
-    for part in parts:
-        file.write(part)
-    file.write(bytes(padded - size))

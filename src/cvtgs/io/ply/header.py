@@ -178,10 +178,9 @@ def _header_lines(block: bytes, path: str) -> tuple[list[str], int]:
         block, first.end() - 1
     )
     if not end:
-        whole = len(block) < MAX_HEADER_BYTES
-        where = "the file" if whole else f"the first {MAX_HEADER_BYTES:,} bytes"
         raise FileFormatError(
-            f"{path}: the PLY header must end with a line 'end_header', found none in {where}."
+            f"{path}: the PLY header must end with a line 'end_header', found none in the first "
+            f"{len(block):,} bytes."
         )
     lines = block[first.end() : max(first.end(), end.start())].split(newline)
     return [_decode(line).replace("\n", " ") for line in lines], end.end()
