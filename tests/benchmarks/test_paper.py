@@ -108,8 +108,7 @@ def test_a_dataset_without_a_test_split_is_refused(root):
     lego = capture_of(root, "lego")
     (lego.folder / "transforms_test.json").unlink()
     assert refusal(lego) == (
-        f"{lego.folder}: must hold transforms_test.json for the split 'test', found "
-        f"transforms_train.json only; choose the other split, or none for all cameras."
+        f"{lego.folder / 'transforms_test.json'}: the file to read must exist, found none."
     )
 
 

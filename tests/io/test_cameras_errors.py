@@ -149,8 +149,7 @@ def test_impossible_splits_are_refused(tmp_path) -> None:
     )
     path.rename(tmp_path / "transforms_train.json")
     assert camera_refusal(tmp_path, InputNotFoundError, split="test") == (
-        f"{tmp_path}: must hold transforms_test.json for the split 'test', found "
-        f"transforms_train.json only; choose the other split, or none for all cameras."
+        f"{tmp_path / 'transforms_test.json'}: the file to read must exist, found none."
     )
 
 

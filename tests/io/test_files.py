@@ -196,9 +196,7 @@ def test_an_unreadable_folder_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr("cvtgs.io.files._scenes", refuse)
     with pytest.raises(InputError) as caught:
         scene_file(tmp_path)
-    assert (
-        str(caught.value) == f"{tmp_path}: the folder must be readable, found: permission denied."
-    )
+    assert str(caught.value) == f"{tmp_path}: the file must be readable, found: permission denied."
 
 
 def test_the_size_of_a_missing_file_is_an_error(tmp_path: Path) -> None:

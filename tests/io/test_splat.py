@@ -112,15 +112,17 @@ def test_a_file_with_a_partial_gaussian_is_refused(tmp_path: Path, size: int) ->
     with pytest.raises(FileFormatError) as caught:
         load(path)
     assert str(caught.value) == (
-        f"{path}: a .splat file must hold one or more Gaussians of 32 bytes each, "
-        f"found {size} bytes."
+        f"{path}: a .splat file must hold one or more Gaussians of 32 bytes each and no header, "
+        f"found {size} bytes that start with {path.read_bytes()[:4]!r}."
     )
 
 
 def test_a_ply_with_the_wrong_suffix_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.splat"
     path.write_bytes(b"ply\n".ljust(64))
-    with pytest.raises(FileFormatError, match="has no header, found a PLY; rename it"):
+    with pytest.raises(
+        FileFormatError, match=r"and no header, found 64 bytes that start with b'ply\\n'"
+    ):
         load(path)
 
 

@@ -205,11 +205,6 @@ def _folder_views(folder: Path, split: Split | None) -> list[View]:
     parts = {name: folder / f"transforms_{name}.json" for name in SPLITS}
     there = [part for part in parts.values() if is_file(part)]
     if there:
-        if split is not None and parts[split] not in there:
-            raise InputNotFoundError(
-                f"{folder}: must hold {parts[split].name} for the split {split!r}, found "
-                f"{there[0].name} only; choose the other split, or none for all cameras."
-            )
         chosen = there if split is None else [parts[split]]
         return [view for part in chosen for view in _file_views(part, split)]
     from cvtgs.io.colmap import colmap_views, is_colmap  # noqa: PLC0415 (when it is read)

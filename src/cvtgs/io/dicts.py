@@ -23,6 +23,7 @@ _TENSORS = {
     "shN": "shN",
     "features_rest": "shN",
 }
+_NEEDED = ("means", "quats", "scales", "opacities", "sh0")
 _KNOWN = (
     "means, quats, scales, opacities, sh0 (or features_dc) and, above SH degree 0, "
     "shN (or features_rest)"
@@ -164,11 +165,7 @@ def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
                 f"and {shown(key)}."
             )
         keys[name] = key
-    missing = [
-        known
-        for known in ("means", "quats", "scales", "opacities", "sh0")
-        if _TENSORS[known] not in keys
-    ]
+    missing = [name for name in _NEEDED if _TENSORS[name] not in keys]
     if missing:
         raise InvalidSceneError(
             f"a dictionary must hold {_KNOWN}, found none named {', '.join(missing)}."

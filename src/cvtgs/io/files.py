@@ -19,7 +19,6 @@ from cvtgs.errors import (
     InputNotFoundError,
     check_path,
     input_errors,
-    reason_of,
 )
 from cvtgs.text import shown
 
@@ -102,11 +101,8 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
     folder = Path(path)
     if not is_folder(folder):
         return folder
-    try:
+    with input_errors(folder):
         found = next(_scenes(folder), None)
-    except OSError as error:
-        reason = reason_of(error)
-        raise InputError(f"{folder}: the folder must be readable, found: {reason}.") from error
     if found is None:
         raise InputError(
             f"{folder}: must be a file or the folder of a trained model, found a directory "

@@ -63,13 +63,12 @@ def read_splat(path: Path) -> GaussianScene:
     """
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
-        if size == 0 or size % _ROW.itemsize:
+        start = file.read(4)
+        if size == 0 or size % _ROW.itemsize or start in (b"ply\n", b"ply\r"):
             raise FileFormatError(
                 f"{path}: a .splat file must hold one or more Gaussians of {_ROW.itemsize} bytes "
-                f"each, found {size:,} bytes."
+                f"each and no header, found {size:,} bytes that start with {start!r}."
             )
-        if file.read(4) in (b"ply\n", b"ply\r"):
-            raise FileFormatError(f"{path}: a .splat file has no header, found a PLY; rename it.")
         file.seek(0)
         rows = np.fromfile(file, _ROW)
     return scene_of(

@@ -145,9 +145,10 @@ def _rest(rest: Float[np.ndarray, "n k 3"]) -> tuple[Images, dict[str, Any]]:
     lines = -(-len(entries) // PALETTE_COLUMNS)
     centroids = np.full((lines * PALETTE_COLUMNS * k, 4), 255, np.uint8)
     centroids[: len(entries) * k, :3] = codes.labels.reshape(-1, 3)
+    bytes_of_labels = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1)
     images = {
         "shN_centroids": centroids.reshape(lines, PALETTE_COLUMNS * k, 4),
-        "shN_labels": _image(_two_bytes(labels)),
+        "shN_labels": _image(bytes_of_labels.astype(np.uint8)),
     }
     meta = {
         "count": len(entries),
@@ -161,10 +162,6 @@ def _rest(rest: Float[np.ndarray, "n k 3"]) -> tuple[Images, dict[str, Any]]:
 def _numbers(codes: Float[np.ndarray, "256"]) -> list[float]:
     """Return float32 numbers with as few digits as distinguish them."""
     return [float(str(code)) for code in codes]
-
-
-def _two_bytes(labels: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "n 3"]:
-    return np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1).astype(np.uint8)
 
 
 def _image(
