@@ -170,19 +170,16 @@ def windows_fault(path: PureWindowsPath) -> str | None:
 
 def _open_temporary(target: Path) -> tuple[Path, BinaryIO]:
     """Open a temporary file beside a target, and remove those that killed processes left."""
-    names = [f".{target.name[:48]}.{number}.tmp" for number in range(_MOST_WRITERS)]
-    for place, name in enumerate(names):
-        temporary = target.with_name(name)
+    names = (f".{target.name[:48]}.{number}.tmp" for number in range(_MOST_WRITERS))
+    places = [target.with_name(name) for name in names]
+    for temporary in places:
         _remove_leftover(temporary)
+    for temporary in places:
         try:
             file = temporary.open("xb")
         except FileExistsError:  # another process writes to it
             continue
         if _lock(file.fileno()) and os.fstat(file.fileno()).st_nlink:
-            for later in names[place + 1 :]:
-                if not os.path.lexists(target.with_name(later)):
-                    break
-                _remove_leftover(target.with_name(later))
             return temporary, file
         file.close()
     temporary = target.with_name(f".{target.name[:48]}.{secrets.token_hex(8)}.tmp")

@@ -51,12 +51,23 @@ def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
             f"{path}: holds the Gaussians of one GPU; {second.name} and further files beside it "
             f"hold the others: add them with cvtgs convert IN OUT --merge FILE.",
         )
-    with _damage_named(path):
+    try:
         tensors, splatfacto = _scene_tensors(_unpickled(path), path)
         check_tensors(tensors)
         if not trust_sizes:
             check_stored(path, tensors)
         scene = from_dict({name: tensor.clone() for name, tensor in tensors.items()})
+    except InvalidSceneError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    except CvtgsError:
+        raise
+    except Exception as error:  # torch's messages may advise letting the file execute any code
+        if is_out_of_memory(error):
+            raise
+        raise FileFormatError(
+            f"{path}: must be an intact checkpoint of tensors and plain numbers, found damage "
+            f"({type(error).__name__})."
+        ) from error
     if splatfacto and scene.sh_degree == 0:
         colors = torch.sigmoid(scene.sh0)
         return scene.with_tensors({"sh0": (colors - 0.5) / SH_C0}, {})
@@ -80,27 +91,6 @@ def _scene_tensors(content: Any, path: Path) -> tuple[dict[str, Tensor], bool]:
         f"{path}: a checkpoint must hold a scene under 'splats' (gsplat) or "
         f"'pipeline' (nerfstudio's Splatfacto), found {found}."
     )
-
-
-@contextmanager
-def _damage_named(path: Path) -> Iterator[None]:
-    """Convert any error of pickle, zip, struct or torch on a damaged file to one sentence.
-
-    torch's messages are not passed on: some advise letting the file execute arbitrary code.
-    """
-    try:
-        yield
-    except InvalidSceneError as error:
-        raise FileFormatError(f"{path}: {error}") from error
-    except CvtgsError:
-        raise
-    except Exception as error:
-        if is_out_of_memory(error):
-            raise
-        raise FileFormatError(
-            f"{path}: must be an intact checkpoint of tensors and plain numbers, found damage "
-            f"({type(error).__name__})."
-        ) from error
 
 
 def _unpickled(path: Path) -> Any:

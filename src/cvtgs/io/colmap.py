@@ -149,11 +149,7 @@ class _Bytes:
     """A binary file whose reads are checked against its size."""
 
     file: BinaryIO
-    size: int
     path: Path
-
-    def left(self) -> int:
-        return self.size - self.file.tell()
 
     def take(self, layout: struct.Struct, what: str) -> tuple[Any, ...]:
         self.check(layout.size, what)
@@ -178,10 +174,11 @@ class _Bytes:
         return _text_of(text)
 
     def check(self, size: int, what: str) -> None:
-        if size > self.left():
+        left = os.fstat(self.file.fileno()).st_size - self.file.tell()
+        if size > left:
             raise FileFormatError(
                 f"{self.path}: the file is cut short: {what} must have {size:,} bytes, "
-                f"found {self.left():,}."
+                f"found {left:,}."
             )
 
 
@@ -189,7 +186,7 @@ def _cameras_of_bin(path: Path) -> dict[int, Lens]:
     """Read ``cameras.bin``."""
     lenses: dict[int, Lens] = {}
     with open_input(path) as file:
-        data = _Bytes(file=file, size=os.fstat(file.fileno()).st_size, path=path)
+        data = _Bytes(file=file, path=path)
         for row in range(data.count("cameras", least=_CAMERA.size)):
             camera, number, width, height = data.take(_CAMERA, f"camera {row}")
             where = f"{path}: camera {row}"
@@ -204,7 +201,7 @@ def _images_of_bin(path: Path) -> list[_Image]:
     """Read ``images.bin``; the points of the images are skipped."""
     images: list[_Image] = []
     with open_input(path) as file:
-        data = _Bytes(file=file, size=os.fstat(file.fileno()).st_size, path=path)
+        data = _Bytes(file=file, path=path)
         for row in range(data.count("images", least=_IMAGE.size + 1 + _COUNT.size)):
             _, *pose, camera = data.take(_IMAGE, f"image {row}")
             name = data.name(f"image {row}")

@@ -58,8 +58,7 @@ def file_of(
     """Copy the rest of a stream to a temporary file, which exists while the context is open.
 
     Errors and warnings in the context that name the file name the stream instead, by ``name`` or
-    its own name.
-    ``advice`` ends the error message if the first bytes match no format.
+    its own name. ``advice`` ends the error message if the first bytes match no format.
     """
     name = name or name_of(stream)
     with ExitStack() as stack:
@@ -77,14 +76,7 @@ def file_of(
                 f"the folder of temporary files must be writable and have room for a copy of "
                 f"{name}, found: {reason_of(error)}; TMPDIR sets another folder."
             ) from error
-        suffix = format or format_of(path)
-        if suffix is None:
-            with path.open("rb") as file:
-                first = file.read(4)
-            raise FileFormatError(
-                f"{name}: the first bytes must be those of a .ply, .spz, .sog, .glb or .pt, found "
-                f"{first!r}; {advice}."
-            )
+        suffix = format or _format_of(path, name, advice)
         path = path.rename(path.with_name(f"stream{suffix}"))
         stack.enter_context(named_in_warnings(path, name))
         try:
@@ -169,15 +161,18 @@ def copy_to(stream: ByteSink, file: BinaryIO) -> None:
             count = stream.write(chunk)
 
 
-def format_of(path: Path) -> str | None:
-    """Return the suffix of the format that the content of a file shows; None if unknown."""
+def _format_of(path: Path, name: str, advice: str) -> str:
+    """Return the suffix of the format that the content of a file shows."""
     with path.open("rb") as file:
         first = file.read(4)
     for start, suffix in _FIRST_BYTES.items():
         if first.startswith(start):
             return suffix
     if not first.startswith(b"PK"):
-        return None
+        raise FileFormatError(
+            f"{name}: the first bytes must be those of a .ply, .spz, .sog, .glb or .pt, found "
+            f"{first!r}; {advice}."
+        )
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()

@@ -70,10 +70,9 @@ class SogFormat:
             sizes[unit.level] += _write_sog(part_of, folder / unit.name)
             dropped.update(dropped_within(part_of, FORMAT_LIMITS[".sog"]))
             listener(ProgressEvent(stage="write", done=number + 1, total=len(units)))
-        levels = tuple(
-            StreamLevel(count, sum(unit.level == number for unit in units), size)
-            for number, (count, size) in enumerate(zip(plan.counts, sizes, strict=True))
-        )
+        files = Counter(unit.level for unit in units)
+        counts = enumerate(plan.counts)
+        levels = tuple(StreamLevel(count, files[level], sizes[level]) for level, count in counts)
         far = tuple(map(len, plan.far))
         environments = {
             level: f".environment_{part}_{level}.ply"

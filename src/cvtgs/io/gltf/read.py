@@ -44,7 +44,7 @@ from cvtgs.io.gltf.document import (
     open_gltf,
 )
 from cvtgs.io.spz import decode_spz
-from cvtgs.math.parameters import matrices_to_quats
+from cvtgs.math.parameters import matrices_to_quats, quats_to_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 from cvtgs.tags import ANTIALIASED
@@ -174,12 +174,8 @@ def _local_matrix(node: _Node) -> Matrix:
         return np.array(node.matrix, np.float64).reshape(4, 4).T
     x, y, z, w = node.rotation
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    matrix[:3, :3] *= node.scale
+    quat = torch.tensor([[w, x, y, z]], dtype=torch.float64, device="cpu")
+    matrix[:3, :3] = quats_to_matrices(quat)[0].numpy() * node.scale
     matrix[:3, 3] = node.translation
     return matrix
 

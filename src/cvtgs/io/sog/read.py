@@ -168,11 +168,14 @@ def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
         quats = _quats(images.rows(document.quats.files[0]))
         log_scales = _decoded(meta.scales, images.rows(document.scales.files[0]))
         colors = images.rows(document.sh0.files[0])
+        opacities = colors[:, 3]
         arrays = Arrays(
             means=means,
             quats=quats,
             log_scales=log_scales,
-            logit_opacities=_logits(colors[:, 3], meta),
+            logit_opacities=logits_of_bytes(opacities)
+            if meta.opacities is None
+            else meta.opacities.astype(np.float32)[opacities],
             sh0=_decoded(meta.colors, colors),
             shN=_rest(images, meta),
         )
@@ -278,13 +281,6 @@ def _quats(stored: UInt8[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
     quats = restore_largest(np.maximum(tags, 0), others)
     quats[tags < 0] = (1, 0, 0, 0)
     return quats
-
-
-def _logits(stored: UInt8[np.ndarray, "n"], meta: _Meta) -> Float[np.ndarray, "n"]:
-    if meta.opacities is None:
-        return logits_of_bytes(stored)
-    logits: Float[np.ndarray, n] = meta.opacities.astype(np.float32)[stored]
-    return logits
 
 
 def _decoded(
