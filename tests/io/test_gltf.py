@@ -142,7 +142,7 @@ def test_all_nodes_and_primitives_are_read(small: Path) -> None:
         document["scenes"] = [{"nodes": [0, 1]}]
 
     first = load(small)
-    with pytest.warns(DroppedDataWarning, match="left out 1 mesh primitive that is not Gauss"):
+    with pytest.warns(DroppedDataWarning, match="left out 1 mesh primitive without Gauss"):
         scene = load(changed(small, repeat))
     assert len(scene) == 10
     torch.testing.assert_close(scene.means[:5], first.means - torch.tensor([5.0, 0, 0]))

@@ -145,10 +145,10 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
                 temporary.unlink(missing_ok=True)
 
 
-def make_folder(folder: str | os.PathLike[str], *, parents: bool = True) -> None:
+def make_folder(folder: str | os.PathLike[str]) -> None:
     """Create a folder to write to, unless it exists."""
     try:
-        Path(folder).mkdir(parents=parents, exist_ok=True)
+        Path(folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(
             f"{os.fspath(folder)}: must be a folder or a new path, found: {reason_of(error)}."

@@ -26,15 +26,13 @@ _POINT_BYTES = 24
 _MAX_NAME = 4096
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Image:
-    """The pose of a registered image, from world to camera."""
+class _Image(NamedTuple):
+    """A registered image, and the number of its camera."""
 
     name: str
     camera: int
-    quat: tuple[float, ...]
-    """Rotation, w first; not zero, not necessarily of unit length."""
-    translation: tuple[float, ...]
+    pose: Sequence[float]
+    """From world to camera: a quaternion, w first, of any length but 0, and a translation."""
 
 
 class _Model(NamedTuple):
@@ -88,12 +86,10 @@ def colmap_views(folder: Path) -> list[View]:
                 f"{path}: image {shown(image.name)} must refer to a camera in the camera file, "
                 f"found camera {image.camera}."
             )
-    quats = torch.tensor(
-        [image.quat for image in images], dtype=torch.float64, device="cpu"
-    ).reshape(-1, 4)
+    poses = np.array([image.pose for image in images], np.float64).reshape(-1, 7)
     viewmats = np.tile(np.eye(4), (len(images), 1, 1))
-    viewmats[:, :3, :3] = parameters.rotation_matrices(quats).numpy()
-    viewmats[:, :3, 3] = np.array([image.translation for image in images]).reshape(-1, 3)
+    viewmats[:, :3, :3] = parameters.rotation_matrices(torch.from_numpy(poses[:, :4])).numpy()
+    viewmats[:, :3, 3] = poses[:, 4:]
     return [
         View(name=image.name, viewmat=viewmat, lens=lenses[image.camera])
         for image, viewmat in zip(images, viewmats, strict=True)
@@ -109,7 +105,7 @@ def _checked_image(name: str, camera: int, *, pose: Sequence[float], where: str)
         )
     if not name:
         raise FileFormatError(f"{where}: the image must have a name, found none.")
-    return _Image(name=name, camera=camera, quat=tuple(pose[:4]), translation=tuple(pose[4:]))
+    return _Image(name, camera, pose)
 
 
 def _find_model(name: str, where: str) -> _Model:

@@ -268,7 +268,7 @@ def _run(
             with one_thread():
                 found = sort_into_blocks(job, workers, clock, keep_all=True)
             _write_targets(spec, targets, found.rows, found.cells)
-    make_folder(spec.folder, parents=False)
+    make_folder(spec.folder)
     blocks = [block for block, counts in enumerate(spec.targets()) if counts[0]]
     unfinished = [block for block in blocks if spec.finished(block) is None]
     with clock.stage("blocks", len(unfinished)) as advance:

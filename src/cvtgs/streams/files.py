@@ -116,7 +116,7 @@ def write_stream(
     check_stream(place, form.kind, overwrite=overwrite)
     hidden = hidden_path(place, "stream")
     shutil.rmtree(hidden, ignore_errors=True)
-    make_folder(hidden, parents=False)
+    make_folder(hidden)
     try:
         part = form.write_part(plan, hidden, part=0, listener=listener)
         write_index(form, [part], hidden)

@@ -171,7 +171,7 @@ def _far_files(parts: Sequence[StreamPart]) -> list[str]:
 
 def _write_sog(scene: GaussianScene, folder: Path) -> int:
     """Write an unbundled SOG; return its size in bytes."""
-    make_folder(folder, parents=False)
+    make_folder(folder)
     total = 0
     for name, content in encode_sog(scene).files():
         with atomic_output(folder / name, overwrite=True) as file:

@@ -48,7 +48,7 @@ from cvtgs.math.parameters import matrices_to_quats, quats_to_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 from cvtgs.tags import ANTIALIASED
-from cvtgs.text import printable, shown
+from cvtgs.text import counted, printable, shown
 
 _KNOWN = (SPLATS, SPZ, QUANTIZATION)
 _POINTS = 0
@@ -142,11 +142,8 @@ def _splats(file: GltfFile) -> Iterator[_Placed]:
             splatting = validated(_Splatting, primitive.extensions[SPLATS], f"{where}: {SPLATS!r}")
             yield _Placed(primitive, splatting, where, matrix)
     if others:
-        warn(
-            f"{file.path}: left out {others:,} mesh "
-            f"{'primitive that is' if others == 1 else 'primitives that are'} not Gaussians.",
-            DroppedDataWarning,
-        )
+        left_out = counted(others, "mesh primitive")
+        warn(f"{file.path}: left out {left_out} without Gaussians.", DroppedDataWarning)
 
 
 def _placed_meshes(file: GltfFile) -> Iterator[tuple[int, Matrix]]:
