@@ -49,7 +49,7 @@ def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
     if second != path and is_file(second):
         warn(
             f"{path}: holds the Gaussians of one GPU; {second.name} and further files beside it "
-            f"hold the others: add them with cvtgs convert IN OUT --merge FILE.",
+            f"hold the others: add them with cvtgs convert IN OUT --merge FILE."
         )
     try:
         tensors, splatfacto = _scene_tensors(_unpickled(path), path)

@@ -96,7 +96,7 @@ def from_dict(
     if not activated and (unlikely := activated_values(scene)):
         warn(
             f"{' and '.join(unlikely)}: they are read as stored values (logarithms of scales, "
-            f"logits of opacities) but look activated; if they are, pass activated=True.",
+            f"logits of opacities) but look activated; if they are, pass activated=True."
         )
     return scene
 

@@ -13,13 +13,7 @@ import pydantic
 from pydantic import AllowInfNan, BeforeValidator, Field, Strict
 from torch import Tensor
 
-from cvtgs.errors import (
-    FileFormatError,
-    InputError,
-    InputNotFoundError,
-    check_path,
-    input_errors,
-)
+from cvtgs.errors import FileFormatError, InputError, InputNotFoundError, check_path, input_errors
 from cvtgs.text import shown
 
 _POINTER = b"version https://git-lfs."

@@ -12,14 +12,7 @@ from tempfile import SpooledTemporaryFile, TemporaryDirectory
 from traceback import clear_frames
 from typing import BinaryIO, Protocol, cast
 
-from cvtgs.errors import (
-    RENAMINGS,
-    CvtgsError,
-    FileFormatError,
-    InputError,
-    OutputError,
-    reason_of,
-)
+from cvtgs.errors import RENAMINGS, CvtgsError, FileFormatError, InputError, OutputError, reason_of
 
 MEMORY_BYTES = 1 << 26
 """A file is built in memory up to this size, and on disk beyond it."""

@@ -25,13 +25,7 @@ from cvtgs.io.files import (
 from cvtgs.text import shown
 
 _PinholeModel = Literal[
-    "PINHOLE",
-    "SIMPLE_PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "FULL_OPENCV",
-    "PERSPECTIVE",
+    "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE"
 ]
 _DISTORTIONS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _OPENGL = np.diag([1.0, -1.0, -1.0])

@@ -19,13 +19,7 @@ from cvtgs.io.limits import FORMAT_LIMITS, dropped_within
 from cvtgs.io.sog import encode_sog
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.scene import GaussianScene, concatenate
-from cvtgs.streams.files import (
-    StreamLevel,
-    StreamPart,
-    join_levels,
-    join_trees,
-    write_stream,
-)
+from cvtgs.streams.files import StreamLevel, StreamPart, join_levels, join_trees, write_stream
 from cvtgs.streams.plan import StreamNode, StreamPlan, environment_level
 
 __all__ = ["write_sog_stream"]
