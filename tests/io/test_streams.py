@@ -246,7 +246,7 @@ def test_streams_that_break_and_closed_ones_are_refused() -> None:
     closed.close()
     with pytest.raises(InputError, match="must be readable to its end, found: I/O operation on"):
         cvtgs.load(closed)
-    with pytest.raises(OutputError, match="must be open for writing in binary mode, found: I/O"):
+    with pytest.raises(OutputError, match=r"in binary mode .* take all bytes, found: i/o"):
         cvtgs.save(storable_scene(5), closed)
 
 
@@ -343,5 +343,5 @@ def test_a_full_disk_behind_a_stream_is_named() -> None:
         def write(self, content: Any) -> int:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-    with pytest.raises(OutputError, match="the Full: cannot be written: no space left on device"):
+    with pytest.raises(OutputError, match=r"must be open .* take all bytes, found: no space left"):
         cvtgs.save(storable_scene(3, degree=0), Full(), format=".ply")

@@ -37,8 +37,6 @@ _OLD_SECONDS = 3600
 _WAITS = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Seconds to wait on Windows for programs that hold a file for a moment, such as virus scanners."""
 
-_DISK_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
-
 
 def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
     """Check that a file could be written, before its content is computed.
@@ -288,10 +286,5 @@ def _refusal(path: str | os.PathLike[str], required: str, found: str) -> OutputE
 
 def write_error(path: str | os.PathLike[str], error: OSError) -> OutputError:
     """Return the error for an output that the system refused to write."""
-    if error.errno in _DISK_FULL:
-        return OutputError(
-            f"{os.fspath(path)}: the output needs more space than the disk has left; "
-            f"nothing was written."
-        )
     reason = reason_of(error)
     return OutputError(f"{os.fspath(path)}: the output must be writable, found: {reason}.")

@@ -132,14 +132,11 @@ def written_to(stream: ByteSink) -> Iterator[BinaryIO]:
         try:
             copy_to(stream, cast(BinaryIO, file))
             getattr(stream, "flush", lambda: None)()
-        except (TypeError, ValueError) as error:  # ValueError: closed, or only for reading
-            found = str(error).rstrip(".")
+        except (TypeError, ValueError, OSError) as error:  # ValueError: closed, or for reading
+            found = reason_of(error).rstrip(".")
             raise OutputError(
-                f"{name_of(stream)}: must be open for writing in binary mode, found: {found}."
-            ) from error
-        except OSError as error:
-            raise OutputError(
-                f"{name_of(stream)}: cannot be written: {reason_of(error)}."
+                f"{name_of(stream)}: must be open for writing in binary mode and take all bytes, "
+                f"found: {found}."
             ) from error
 
 
