@@ -83,26 +83,24 @@ def read_compressed_ply(path: Path) -> GaussianScene:
         _check(header, path)
         tables = _read_tables(file, header, path)
     with np.errstate(all="ignore"):  # damaged ranges give non-finite numbers
-        return replace(_scene_of(tables), comments=header.comments)
+        return replace(scene_of(_unpacked(tables)), comments=header.comments)
 
 
-def _scene_of(tables: dict[str, Rows]) -> GaussianScene:
+def _unpacked(tables: dict[str, Rows]) -> Arrays:
     ranges = _ranges(tables["chunk"])
-    vertices = tables["vertex"]
-    places, rotations, scales, rgba = (vertices[name] for name in _PACKED)
+    places, rotations, scales, rgba = (tables["vertex"][name] for name in _PACKED)
     colors = _unpack(rgba, _COLOR_BITS)
     opacities = (rgba & np.uint32(255)).astype(np.uint8)
     largest = (rotations >> np.uint32(30)).astype(np.int64)
     others = (_unpack(rotations, _QUAT_BITS) - np.float32(0.5)) * np.sqrt(np.float32(2))
-    arrays = Arrays(
+    return Arrays(
         means=_between(ranges[:, 0:6], _unpack(places, _THREE_BITS)),
         quats=restore_largest(largest, others),
         log_scales=_between(ranges[:, 6:12], _unpack(scales, _THREE_BITS)),
         logit_opacities=logits_of_bytes(opacities),
         sh0=sh0_of_colors(_between(ranges[:, 12:18], colors[:, :3])),
-        shN=_rest(tables.get("sh"), len(vertices)),
+        shN=_rest(tables.get("sh"), len(places)),
     )
-    return scene_of(arrays)
 
 
 def _between(
