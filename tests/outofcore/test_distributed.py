@@ -6,9 +6,8 @@ import signal
 import subprocess
 import sys
 import time
-from importlib import import_module
-from operator import attrgetter
 from pathlib import Path
+from pkgutil import resolve_name
 
 import pytest
 
@@ -111,7 +110,7 @@ class Answers:
         return {"workers": {"tcp://10.0.0.2:1": {}}}
 
     def submit(self, function, *arguments, **options):
-        if function is import_module or isinstance(function, attrgetter):
+        if function is resolve_name:
             return self.Future("finished", None, cvtgs.__version__)
         return self.Future("error" if self.error else "finished", self.error, self.answer)
 

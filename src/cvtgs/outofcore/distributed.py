@@ -8,9 +8,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
-from importlib import import_module
-from operator import attrgetter
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -179,52 +178,48 @@ class ClusterWorkers:
             RunError: There is no worker, or one has no cvtgs, another version, or no access to
                 the source or to the folder of the output.
         """
+        token, probe = secrets.token_hex(8), job.path("probe")
         with _scheduler_errors():
             addresses = self._wait_for_workers()
-            self._check_packages(addresses)
-            self._check_access(addresses, job)
+            # Without this cvtgs, calls of its functions might never be answered.
+            for address, version in self._ask(addresses, resolve_name, "cvtgs:__version__"):
+                if version != cvtgs.__version__:
+                    raise _has_no_cvtgs(address, version)
+            probe.write_text(token, encoding="ascii")
+            try:
+                for address, seen in self._ask(
+                    addresses, _inspect, job.source.path, str(probe), token
+                ):
+                    _check_sight(address, seen, job)
+            finally:
+                probe.unlink(missing_ok=True)
         return len(addresses)
 
-    def _check_access(self, addresses: Sequence[str], job: Job) -> None:
-        """Raise if a worker cannot access the files that a job reads and writes."""
+    def _ask(
+        self, addresses: Sequence[str], function: Callable[..., Any], *arguments: str
+    ) -> Iterator[tuple[str, Any]]:
+        """Call a function on every worker; yield the answers, or raise if there is none."""
         from distributed import wait  # noqa: PLC0415 (optional)
 
-        token, probe = secrets.token_hex(8), job.path("probe")
-        probe.write_text(token, encoding="ascii")
-        arguments = (job.source.path, str(probe), token)
-        futures = {
-            address: self._client.submit(_inspect, *arguments, workers=[address], pure=False)
+        futures = [
+            self._client.submit(function, *arguments, workers=[address], pure=False)
             for address in addresses
-        }
-        with suppress(TimeoutError):  # workers without an answer are named below
-            wait(list(futures.values()), timeout=ANSWER_SECONDS)
-        try:
-            for address, future in futures.items():
-                _check_answer(address, future, job)
-        finally:
-            probe.unlink(missing_ok=True)
-            self._cancel(list(futures.values()))
-
-    def _check_packages(self, addresses: Sequence[str]) -> None:
-        """Raise if a worker lacks this cvtgs: calls of its functions might never be answered."""
-        from distributed import wait  # noqa: PLC0415 (optional)
-
-        call, answers = self._client.submit, {}
-        for address in addresses:
-            package = call(import_module, "cvtgs", workers=[address], pure=False)
-            version = call(attrgetter("__version__"), package, workers=[address], pure=False)
-            answers[address] = version
+        ]
         with suppress(TimeoutError):
-            wait(list(answers.values()), timeout=ANSWER_SECONDS)
-        for address, future in answers.items():
-            found = _message_of(future.exception()) if future.status == "error" else None
-            if future.status == "finished" and future.result() != cvtgs.__version__:
-                found = str(future.result())
-            if found is not None:
-                raise RunError(
-                    f"{address}: this worker must have cvtgs {cvtgs.__version__}, found {found}; "
-                    "install it in the environment of every worker."
-                )
+            wait(futures, timeout=ANSWER_SECONDS)
+        try:
+            for address, future in zip(addresses, futures, strict=True):
+                if future.status == "error":
+                    raise _has_no_cvtgs(address, _message_of(future.exception()))
+                if future.status != "finished":
+                    raise RunError(
+                        f"{address}: this worker must answer within {ANSWER_SECONDS:g} s, found no "
+                        "answer; stop it, install the same cvtgs there, or wait until it is less "
+                        "busy."
+                    )
+                yield address, future.result()
+        finally:
+            self._cancel(futures)
 
     def _wait_for_workers(self) -> list[str]:
         deadline = time.monotonic() + ANSWER_SECONDS
@@ -245,14 +240,7 @@ class ClusterWorkers:
     def __call__(
         self, function: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterable[Result]:
-        """Call a function for every item.
-
-        Args:
-            function: A function that can be pickled.
-            items: Its arguments; each call is a task.
-
-        Yields:
-            The results, in the order of the items.
+        """Call a function for every item, as :class:`Workers` do; each call is a task.
 
         Raises:
             RunError: A task fails repeatedly.
@@ -310,19 +298,15 @@ class ClusterWorkers:
         return self._client.status == "running" and bool(self._addresses())
 
 
-def _check_answer(address: str, future: "Future[Any]", job: Job) -> None:
-    """Raise if a worker cannot do a job."""
-    if future.status == "error":
-        raise RunError(
-            f"{address}: this worker must have cvtgs {cvtgs.__version__}, found: "
-            f"{_message_of(future.exception())}."
-        )
-    if future.status != "finished":
-        raise RunError(
-            f"{address}: this worker must answer within {ANSWER_SECONDS:g} s, found no answer; "
-            "stop it, install the same cvtgs there, or wait until it is less busy."
-        )
-    found: _Worker = future.result()
+def _has_no_cvtgs(address: str, found: str) -> RunError:
+    return RunError(
+        f"{address}: this worker must have cvtgs {cvtgs.__version__}, found {found}; "
+        "install it in the environment of every worker."
+    )
+
+
+def _check_sight(address: str, found: _Worker, job: Job) -> None:
+    """Raise if a worker has other packages, or does not see the files of a job."""
     if found.versions != _versions():
         raise RunError(_differs(address, found.versions))
     size = Path(job.source.path).stat().st_size
