@@ -55,13 +55,6 @@ class Drawn(NamedTuple):
     fixed: int
 
 
-class BlockViews(NamedTuple):
-    """The cameras that look at a block while it is matched and refined; None if it is not."""
-
-    matching: Cameras | None
-    refinement: Cameras | None
-
-
 @one_thread()
 def improve(job: Job, block: int) -> None:
     """Match a simplified block to images and refine it; other blocks are rendered unimproved.
@@ -72,10 +65,10 @@ def improve(job: Job, block: int) -> None:
         return
     own, found, config = load(job.small_path(block)), read_cells(job, block), job.config
     drawn = _draw(job, block, own, found)
-    views = _choose_views(job, drawn)
+    views, later = _choose_views(job, drawn)
     small, changes, observed = drawn.small, dict[str, Any](), None
-    if views.matching is not None:
-        observed = observe(drawn.full, views.matching)
+    if views is not None:
+        observed = observe(drawn.full, views)
         targets = cell_contributions(observed.contributions[drawn.fixed :], found.partition)
         small, changes["matching"] = match_views(
             small,
@@ -84,11 +77,11 @@ def improve(job: Job, block: int) -> None:
             config=config.match,
             frozen=drawn.fixed,
         )
-    if views.refinement is not None:
+    if later is not None:
         small, changes["refinement"] = refine(
             small,
             drawn.full,
-            cameras=views.refinement,
+            cameras=later,
             config=config.refine,
             seed=config.seed,
             device="cpu",
@@ -103,17 +96,17 @@ def improve(job: Job, block: int) -> None:
     write_block(job, block, improved, report, is_improved=True)
 
 
-def _choose_views(job: Job, drawn: Drawn) -> BlockViews:
-    """Choose from the given cameras, or generate some that look at a block."""
+def _choose_views(job: Job, drawn: Drawn) -> tuple[Cameras | None, Cameras | None]:
+    """Return cameras that look at a block, given or new: for matching and for refinement."""
     config, seed = job.config, job.config.seed
     matches, refines = config.match.enabled and config.uses_renders, config.refine.enabled
     members = drawn.full.select(torch.arange(drawn.fixed, len(drawn.full)))
     if job.cameras is not None:
         shown = cameras_of_block(job.cameras, members)
         if len(shown) < LEAST_CAMERAS:
-            return BlockViews(None, None)
+            return None, None
         views = visibility_cameras(members, config, cameras=shown) if matches else None
-        return BlockViews(views, shown if refines else None)
+        return views, shown if refines else None
     fixed = drawn.small.select(torch.arange(drawn.fixed))
     own = drawn.small.means[drawn.fixed :]
     near = fixed.select(_near(fixed.means, own))
@@ -125,7 +118,7 @@ def _choose_views(job: Job, drawn: Drawn) -> BlockViews:
     if refines:
         number = min(config.refine.images, config.refine.steps) + config.refine.heldout
         later = make(max(2, number), size=config.refine.size, seed=seed + LATER_SEED)
-    return BlockViews(views, later)
+    return views, later
 
 
 def cameras_of_block(cameras: Cameras, members: GaussianScene) -> Cameras:

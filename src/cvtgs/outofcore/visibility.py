@@ -8,7 +8,6 @@ import json
 import math
 
 import torch
-from torch import Tensor
 
 from cvtgs.analysis.analyze import drop_mip_tag, measured_areas, visibility_cameras
 from cvtgs.boxes import inside
@@ -83,23 +82,17 @@ def add_contributions(job: Job) -> None:
 
 def read_apparent_rows(job: Job, block: int, *, is_slim: bool = True) -> BlockRows:
     """Read rows, with the areas that images measured if there are images."""
-    rows, mass_per_pixel = read_rows(job, block, is_slim=is_slim), _mass_per_pixel(job)
-    if mass_per_pixel is None:
+    rows = read_rows(job, block, is_slim=is_slim)
+    if not job.config.uses_renders:
+        return rows
+    sums = json.loads(job.path(MEASURED).read_bytes())
+    if sums["pixels"] == 0.0:
         return rows
     measured = measured_areas(
         rows.apparent_areas,
         rows.scene.opacities,
         job.read("contributions", block)["contributions"],
-        mass_per_pixel=mass_per_pixel,
+        mass_per_pixel=torch.tensor(sums["mass"] / sums["pixels"], dtype=torch.float64),
         share=job.config.visibility.mass_share,
     )
     return rows._replace(apparent_areas=measured)
-
-
-def _mass_per_pixel(job: Job) -> Tensor | None:
-    if not job.config.uses_renders:
-        return None
-    sums = json.loads(job.path(MEASURED).read_bytes())
-    if sums["pixels"] == 0.0:
-        return None
-    return torch.tensor(sums["mass"] / sums["pixels"], dtype=torch.float64)

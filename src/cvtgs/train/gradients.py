@@ -4,7 +4,7 @@ import math
 import random
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,13 +24,7 @@ CaseWithViews = tuple[Case, tuple[TargetViews, ...]]
 
 
 class CaseGradient(NamedTuple):
-    """Loss and gradient of one case of a step.
-
-    Attributes:
-        name: Name of the case: scene and ratio.
-        loss: Its loss.
-        gradients: Gradient of every parameter.
-    """
+    """Loss of one case of a step, named by scene and ratio, and gradient of every parameter."""
 
     name: str
     loss: float
@@ -42,16 +36,6 @@ class CaseGradient(NamedTuple):
         return math.isfinite(self.loss) and all(
             bool(one.isfinite().all()) for one in self.gradients
         )
-
-
-class _Task(NamedTuple):
-    """A case of a step for another process; ``config`` is JSON, ``cache`` holds prepared scenes."""
-
-    config: str
-    cache: Path
-    net: Net
-    step: int
-    number: int
 
 
 @contextmanager
@@ -73,16 +57,17 @@ def step_gradients(
         return
     text = config.model_dump_json()
     with LocalWorkers(processes, "with --resume and OMP_NUM_THREADS=1") as workers:
-        yield lambda net, step: list(
-            workers(_compute, [_Task(text, cache, net, step, number) for number in numbers])
-        )
+        yield lambda net, step: list(workers(partial(_compute, text, cache, net, step), numbers))
 
 
-def _compute(task: _Task) -> CaseGradient:
-    config = TrainConfig.model_validate_json(task.config)
-    cases = _training_cases(task.config, task.cache)
+def _compute(config_text: str, cache: Path, net: Net, step: int, number: int) -> CaseGradient:
+    """Compute the gradients of a case in another process."""
+    config, cases = (
+        TrainConfig.model_validate_json(config_text),
+        _training_cases(config_text, cache),
+    )
     copies = DeviceCopies(torch.device("cpu"))
-    return _case_gradient(task.net, cases, config, copies, task.step, task.number)
+    return _case_gradient(net, cases, config, copies, step, number)
 
 
 @lru_cache(maxsize=1)
