@@ -47,17 +47,11 @@ LARGEST_DEPTH = 6.0
 
 
 class LinearView(NamedTuple):
-    """One image as a linear function of changes of colours.
-
-    Attributes:
-        weights: Blending weights of the scene.
-        basis: ``(m, k)`` SH basis in the viewing direction of each Gaussian.
-        residual: Target image minus rendered image.
-    """
+    """One image as a linear function of changes of colours."""
 
     weights: BlendingWeights
-    basis: Float[Tensor, "m k"]
-    residual: Float[Tensor, "h w 3"]
+    basis: Float[Tensor, "m k"]  # SH basis in the viewing direction of each Gaussian
+    residual: Float[Tensor, "h w 3"]  # target image minus rendered image
 
     def paint(self, changes: Float[Tensor, "m k 3"]) -> Float[Tensor, "h w 3"]:
         """Return the change of the image for given changes of the coefficients."""

@@ -35,18 +35,14 @@ LEAST_PIXELS: Mapping[LpipsNetwork, int] = MappingProxyType({"alex": 31, "vgg": 
 
 
 class Convolution(NamedTuple):
-    """A convolution with its ReLU, identified by its index in torchvision's ``features``.
+    """A convolution with its ReLU."""
 
-    ``pool`` is the kernel size of the max pooling before it (stride 2), 0 for none; activations
-    are compared where ``tap`` is set.
-    """
-
-    number: int
+    number: int  # in torchvision's ``features``
     shape: tuple[int, int, int, int]
     stride: int = 1
     padding: int = 1
-    pool: int = 0
-    tap: bool = True
+    pool: int = 0  # kernel size of the max pooling before it (stride 2), 0 for none
+    tap: bool = True  # whether its activations are compared
 
 
 _VGG_BLOCKS = (

@@ -40,19 +40,12 @@ def bounding_box(points: Float[Tensor, "n d"]) -> Float[Tensor, "2 d"]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Balls:
-    """Balls around points; only positions inside a ball can be nearer than those already found.
+    """Balls around points; only positions inside a ball can be nearer than those already found."""
 
-    Attributes:
-        centers: ``(n, d)`` positions; ideally sorted along a space-filling curve.
-        squared: ``(n,)`` squared radii.
-        run_boxes: ``(r, 2, d)`` bounding boxes of runs of consecutive centres.
-        run_squared: ``(r,)`` largest squared radius of each run.
-    """
-
-    centers: Float[Tensor, "n d"]
-    squared: Float[Tensor, "n"]
-    run_boxes: Float[Tensor, "r 2 d"]
-    run_squared: Float[Tensor, "r"]
+    centers: Float[Tensor, "n d"]  # ideally sorted along a space-filling curve
+    squared: Float[Tensor, "n"]  # radii
+    run_boxes: Float[Tensor, "r 2 d"]  # bounding boxes of runs of consecutive centres
+    run_squared: Float[Tensor, "r"]  # largest squared radius of each run
 
     @classmethod
     def around(cls, centers: Float[Tensor, "n d"], squared: Float[Tensor, "n"]) -> Self:
@@ -87,14 +80,11 @@ def _run_maxima(values: Float[Tensor, "n"]) -> Float[Tensor, "r"]:
 
 
 class Assignment(NamedTuple):
-    """Block of every point's nearest site (-1 is the own one), its number there, and its distance.
+    """The nearest site of every point."""
 
-    Distances are squared, in float64.
-    """
-
-    blocks: Int[Tensor, "n"]
-    labels: Int[Tensor, "n"]
-    squared: Float[Tensor, "n"]
+    blocks: Int[Tensor, "n"]  # its block; -1 is the own one
+    labels: Int[Tensor, "n"]  # its number there
+    squared: Float[Tensor, "n"]  # its squared distance, float64
 
 
 def assign_points(

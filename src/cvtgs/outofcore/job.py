@@ -55,54 +55,32 @@ Step = Literal[
 
 
 class Manifest(pydantic.BaseModel):
-    """Record written once all rows are sorted into blocks; from then on the job can be resumed.
-
-    Attributes:
-        key: Digest of everything that the result depends on.
-        total: Number of Gaussians that all blocks keep together.
-        cells: Number of cells of the tessellation in each block; their sum is at least ``total``.
-        left_out_mass: Mass of the Gaussians that the filter leaves out.
-    """
+    """Record written once all rows are sorted into blocks; from then on the job can be resumed."""
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
-    key: str
-    total: int
-    cells: tuple[int, ...]
-    left_out_mass: float
+    key: str  # digest of everything that the result depends on
+    total: int  # Gaussians that all blocks keep together
+    cells: tuple[int, ...]  # of the tessellation in each block; their sum is at least ``total``
+    left_out_mass: float  # of the Gaussians that the filter leaves out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """Description of the whole job, small enough to be sent to every process.
+    """Description of the whole job, small enough to be sent to every process."""
 
-    Attributes:
-        folder: Folder of the files that blocks exchange; every process must have access.
-        source: The input file.
-        target: Number of Gaussians to keep, including those in boxes.
-        blocks: Number of blocks.
-        boxes: Protected regions.
-        config: The configuration.
-        has_network: Whether the folder holds a checkpoint.
-        range_rows: Rows of the file that one process reads in one call.
-        sample_rows: Size of the sample of Gaussians from which the blocks are laid out.
-        cell_room: Number of cells that may merge together in one process.
-        axes: Axes of the output: the directions of x, y and z.
-        cameras: Cameras for presets that render the scene; None generates views.
-    """
-
-    folder: str
+    folder: str  # of the files that blocks exchange; every process must have access
     source: PlyRows
-    target: int
+    target: int  # Gaussians to keep, including those in boxes
     blocks: int
-    boxes: tuple[Box, ...]
+    boxes: tuple[Box, ...]  # protected regions
     config: SimplifyConfig
-    has_network: bool
-    range_rows: int
-    sample_rows: int = SAMPLE_ROWS
-    cell_room: int = CELL_ROOM
-    axes: str = SCENE_AXES
-    cameras: Cameras | None = None
+    has_network: bool  # whether the folder holds a checkpoint
+    range_rows: int  # rows of the file that one process reads in one call
+    sample_rows: int = SAMPLE_ROWS  # size of the sample from which the blocks are laid out
+    cell_room: int = CELL_ROOM  # cells that may merge together in one process
+    axes: str = SCENE_AXES  # directions of x, y and z in the output
+    cameras: Cameras | None = None  # for presets that render the scene; None generates views
 
     def path(self, name: str) -> Path:
         """Return the path of a file of the job."""

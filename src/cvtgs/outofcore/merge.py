@@ -30,17 +30,10 @@ EXTRA = "extra/"
 
 
 class BlockReport(CellStatistics):
-    """Report of a block.
+    """Report of a block."""
 
-    Attributes:
-        input_count: Number of Gaussians in the cells of the block.
-        mass_out: Opacity times mean projected area of the result, squared scene units.
-        matching: Report of the matching to images; None if there was none.
-        refinement: Report of the refinement; None if there was none.
-    """
-
-    input_count: int
-    mass_out: float
+    input_count: int  # Gaussians in the cells of the block
+    mass_out: float  # opacity times mean projected area of the result, squared scene units
     matching: MatchReport | None = None
     refinement: RefineReport | None = None
 

@@ -31,19 +31,12 @@ from cvtgs.scene import GaussianScene
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KdPartition:
-    """A k-d tree (Bentley 1975) whose leaves are blocks.
+    """A k-d tree (Bentley 1975) whose leaves are blocks; a single block has no nodes."""
 
-    Attributes:
-        axes: ``(k,)`` the axis along which each node splits.
-        thresholds: ``(k,)`` coordinate of each splitting plane; points below it go left.
-        children: ``(k, 2)`` left and right child of each node; ``-1 - b`` is block b.
-        count: Number of blocks; a single block has no nodes.
-    """
-
-    axes: Int[Tensor, "k"]
-    thresholds: Float[Tensor, "k"]
-    children: Int[Tensor, "k 2"]
-    count: int
+    axes: Int[Tensor, "k"]  # along which each node splits
+    thresholds: Float[Tensor, "k"]  # coordinate of the splitting plane; points below it go left
+    children: Int[Tensor, "k 2"]  # left and right; ``-1 - b`` is block b
+    count: int  # of blocks
 
     def blocks_of(self, points: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
         """Return the block of every point."""
@@ -132,24 +125,17 @@ class RowRange(NamedTuple):
 class RangeTotals(NamedTuple):
     """Sums over the valid rows of a range.
 
-    Attributes:
-        depths: Grid of optical depths (:func:`cvtgs.analysis.visibility.add_depths`).
-        masses: ``(c,)`` sum of opacity times mean projected area over each chunk of rows, squared
-            scene units; added in order, they give the same bits for any division into ranges.
-        falloff_masses: ``(c,)`` the same sums with masses times the perspective falloff.
-        far_masses: ``(f,)`` mass times falloff of each Gaussian beyond the distance of flyaways.
-        invalid_rows: Number of invalid rows, by the attribute that is NaN, infinite or zero.
-        valid_count: Number of valid rows.
-        kept_count: Number of valid rows in boxes.
+    Sums of masses are those of single chunks of rows. Added in order, they give the same bits for
+    any division into ranges.
     """
 
-    depths: Int[Tensor, "voxels"]
-    masses: tuple[float, ...]
-    falloff_masses: tuple[float, ...]
-    far_masses: Float[Tensor, "f"]
-    invalid_rows: dict[str, int]
+    depths: Int[Tensor, "voxels"]  # optical depths (:func:`cvtgs.analysis.visibility.add_depths`)
+    masses: tuple[float, ...]  # opacity times mean projected area, squared scene units
+    falloff_masses: tuple[float, ...]  # the same times the perspective falloff
+    far_masses: Float[Tensor, "f"]  # the same of each Gaussian beyond the distance of flyaways
+    invalid_rows: dict[str, int]  # by the attribute that is NaN, infinite or zero
     valid_count: int
-    kept_count: int
+    kept_count: int  # valid rows in boxes
 
     @property
     def mass(self) -> float:
@@ -164,41 +150,22 @@ class RangeTotals(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SceneScan:
-    """Data of the whole scene that all blocks need.
-
-    Attributes:
-        frame: Robust centre and radius.
-        plan: The effects that the scene needs.
-        visibility: Grid of ambient visibility (:func:`cvtgs.analysis.visibility.visibility_grid`).
-        min_opacity: The filter leaves out Gaussians of lower opacity.
-        max_flyaway_mass: The filter leaves out flyaways whose mass, times the perspective falloff,
-            is at most this; -1 leaves out none.
-        mean_weight: Mean weight in the tessellation, before the floor.
-        cell_weight: Weight of one cell; heavier Gaussians count as one cell. 0 if all count as one.
-        partition: The blocks, in contracted space.
-        view_components: Components of the view-dependent colour
-            (:func:`cvtgs.cells.view_components`).
-        mass: Opacity times mean projected area of all valid Gaussians, squared scene units.
-        mass_unit: Unit of the masses in moments (:func:`cvtgs.cells.moments.mass_unit`).
-        invalid_rows: Rows that are dropped, by the attribute that is NaN, infinite or zero.
-        row_count: Number of valid Gaussians outside boxes.
-        kept_count: Number of valid Gaussians in boxes.
-    """
+    """Data of the whole scene that all blocks need."""
 
     frame: RobustFrame
     plan: EffectPlan
-    visibility: Float[Tensor, "voxels"]
-    min_opacity: float
-    max_flyaway_mass: float
-    mean_weight: float
-    cell_weight: float
-    partition: KdPartition
-    view_components: Float[Tensor, "c k"]
-    mass: float
-    mass_unit: float
-    invalid_rows: dict[str, int]
-    row_count: int
-    kept_count: int
+    visibility: Float[Tensor, "voxels"]  # :func:`cvtgs.analysis.visibility.visibility_grid`
+    min_opacity: float  # the filter leaves out Gaussians of lower opacity,
+    max_flyaway_mass: float  # and flyaways of at most this mass times falloff; -1: none
+    mean_weight: float  # in the tessellation, before the floor
+    cell_weight: float  # heavier Gaussians count as one cell; 0 if all do
+    partition: KdPartition  # the blocks, in contracted space
+    view_components: Float[Tensor, "c k"]  # :func:`cvtgs.cells.view_components`
+    mass: float  # opacity times mean projected area of all valid Gaussians, squared scene units
+    mass_unit: float  # of the masses in moments (:func:`cvtgs.cells.moments.mass_unit`)
+    invalid_rows: dict[str, int]  # by the attribute that is NaN, infinite or zero
+    row_count: int  # valid Gaussians outside boxes
+    kept_count: int  # valid Gaussians in boxes
 
 
 def read_sample(source: PlyRows, count: int = SAMPLE_ROWS) -> GaussianScene:

@@ -84,19 +84,12 @@ class Attempt:
 
 
 class SortedBlocks(NamedTuple):
-    """The blocks after all rows are sorted into them.
+    """The blocks after all rows are sorted into them."""
 
-    Attributes:
-        rest: Number of Gaussians that all blocks keep together.
-        rows: Number of Gaussians in each block.
-        cells: Weight of each block, in cells; a Gaussian counts at most 1.
-        left_out_mass: Mass that the filter leaves out, squared scene units.
-    """
-
-    rest: int
-    rows: list[int]
-    cells: list[float]
-    left_out_mass: float
+    rest: int  # Gaussians that all blocks keep together
+    rows: list[int]  # Gaussians in each block
+    cells: list[float]  # weight of each block, in cells; a Gaussian counts at most 1
+    left_out_mass: float  # by the filter, squared scene units
 
 
 def sort_into_blocks(

@@ -25,22 +25,13 @@ TRAINING_SEED = 211
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RefineViews:
-    """The views of a refinement.
+    """The views of a refinement; held-out ones decide which scene is kept."""
 
-    Attributes:
-        heldout: Held-out cameras, single and of one size, which decide which scene is kept.
-        training: Single training cameras.
-        endless: Whether ``training`` never ends.
-        heldout_images: Further held-out views, already rendered.
-        images: Training images that are already rendered before the first step, of which steps see
-            all pixels.
-    """
-
-    heldout: tuple[Cameras, ...]
-    training: Iterator[Cameras]
-    endless: bool
-    heldout_images: tuple[ViewImage, ...] = ()
-    images: tuple[ViewImage, ...] = ()
+    heldout: tuple[Cameras, ...]  # single cameras of one size
+    training: Iterator[Cameras]  # single cameras
+    endless: bool  # whether ``training`` never ends
+    heldout_images: tuple[ViewImage, ...] = ()  # further held-out views, already rendered
+    images: tuple[ViewImage, ...] = ()  # rendered before the first step; steps see all pixels
 
 
 def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> RefineViews:

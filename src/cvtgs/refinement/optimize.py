@@ -109,19 +109,12 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Optimized:
-    """The result of an optimization.
+    """The result of an optimization."""
 
-    Attributes:
-        scene: The best scene by held-out images; the input scene if none was better.
-        before: Score of the input scene, dB.
-        after: Score of the best scene, dB.
-        stopped: Reason for the end: ``steps``, ``time``, ``patience`` or ``perfect``.
-    """
-
-    scene: GaussianScene
-    before: float
-    after: float
-    stopped: str
+    scene: GaussianScene  # the best by held-out images; the input scene if none was better
+    before: float  # score of the input scene, dB
+    after: float  # score of the best scene, dB
+    stopped: str  # reason for the end: ``steps``, ``time``, ``patience`` or ``perfect``
 
 
 def optimize(

@@ -34,22 +34,13 @@ _BANDS = (1.0, 0.9, 0.72, 0.5)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chunk:
-    """Rows ``start`` to ``stop`` of a part of a scene, and their random numbers.
-
-    Attributes:
-        start: First row.
-        stop: Row after the last one.
-        total: Number of Gaussians of the whole part, which sets their spacing.
-        rest_count: Number of view-dependent SH coefficients per channel.
-        shift: ``(2,)`` offset of the part's low-discrepancy sequence.
-        generator: Source of the random numbers.
-    """
+    """Rows ``start`` to ``stop`` of a part of a scene, and their random numbers."""
 
     start: int
     stop: int
-    total: int
-    rest_count: int
-    shift: Float[Tensor, "2"]
+    total: int  # Gaussians of the whole part, which sets their spacing
+    rest_count: int  # view-dependent SH coefficients per channel
+    shift: Float[Tensor, "2"]  # of the part's low-discrepancy sequence
     generator: torch.Generator
 
     def __len__(self) -> int:
@@ -101,21 +92,13 @@ Draw = Callable[[Chunk], GaussianScene]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Material:
-    """Parameters of the Gaussians that cover a surface.
+    """Parameters of the Gaussians that cover a surface."""
 
-    Attributes:
-        overlap: Median length of the Gaussians, in spacings.
-        faintness: Lowers opacities; see :meth:`Chunk.opacities`.
-        specular: Brightness of the highlights.
-        thickness: Standard deviation of the distance from the surface, in spacings.
-        lit: Whether sun and sky light the surface; if not, its colours are those of the texture.
-    """
-
-    overlap: float = 1.25
-    faintness: float = 0.0
-    specular: float = 0.0
-    thickness: float = 0.04
-    lit: bool = True
+    overlap: float = 1.25  # median length of the Gaussians, in spacings
+    faintness: float = 0.0  # lowers opacities; see :meth:`Chunk.opacities`
+    specular: float = 0.0  # brightness of the highlights
+    thickness: float = 0.04  # standard deviation of the distance from the surface, in spacings
+    lit: bool = True  # by sun and sky; if not, the colours are those of the texture
 
 
 def rotations_from_axes(

@@ -18,25 +18,15 @@ FACE_STEP = 32.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurfacePoints:
-    """Points of a surface.
-
-    Attributes:
-        points: ``(n, 3)`` positions.
-        normals: ``(n, 3)`` unit normals of the visible side.
-        tangents: ``(n, 3)`` unit directions of the first texture coordinate.
-        bitangents: ``(n, 3)`` unit directions of the second one.
-        coords: ``(n, 2)`` texture coordinates, scene units.
-        areas: ``(n,)`` area that the surface would have at the local point density throughout.
-        rims: ``(n, 2)`` distance to the border along each texture coordinate.
-    """
+    """Points of a surface."""
 
     points: Float[Tensor, "n 3"]
-    normals: Float[Tensor, "n 3"]
-    tangents: Float[Tensor, "n 3"]
-    bitangents: Float[Tensor, "n 3"]
-    coords: Float[Tensor, "n 2"]
-    areas: Float[Tensor, "n"]
-    rims: Float[Tensor, "n 2"]
+    normals: Float[Tensor, "n 3"]  # unit normals of the visible side
+    tangents: Float[Tensor, "n 3"]  # unit directions of the first texture coordinate
+    bitangents: Float[Tensor, "n 3"]  # unit directions of the second one
+    coords: Float[Tensor, "n 2"]  # texture coordinates, scene units
+    areas: Float[Tensor, "n"]  # of the surface, had it the local point density throughout
+    rims: Float[Tensor, "n 2"]  # distance to the border along each texture coordinate
 
 
 _FACES = (

@@ -114,15 +114,10 @@ def noise_tile(generator: torch.Generator) -> Float[Tensor, "k k"]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Random:
-    """Random numbers, colours and textures of a layout.
-
-    Attributes:
-        generator: Source of the random numbers; every method draws from it.
-        tile: Periodic noise that all noisy textures share.
-    """
+    """Random numbers, colours and textures of a layout; every method draws."""
 
     generator: torch.Generator
-    tile: Float[Tensor, "k k"]
+    tile: Float[Tensor, "k k"]  # periodic noise that all noisy textures share
 
     def uniform(self, low: float, high: float) -> float:
         """Draw a uniform number."""

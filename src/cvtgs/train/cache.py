@@ -29,17 +29,11 @@ CACHE_VERSION = 9
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrainingScene:
-    """The data of one scene.
-
-    Attributes:
-        name: Name of the scene.
-        views: Images, one entry per size.
-        cases: The scene at several ratios.
-    """
+    """The data of one scene."""
 
     name: str
-    views: tuple[TargetViews, ...]
-    cases: tuple[Case, ...]
+    views: tuple[TargetViews, ...]  # one entry per size of images
+    cases: tuple[Case, ...]  # the scene at several ratios
 
 
 def prepare_scene(source: Source, config: TrainConfig, folder: Path) -> TrainingScene:

@@ -36,17 +36,14 @@ DEVICE_BYTES = 10**9
 
 
 class MergedScene(NamedTuple):
-    """The valid Gaussians of a scene, and one merged Gaussian per cell, before the network.
-
-    The radius is that of the robust frame of the scene, scene units.
-    """
+    """The valid Gaussians of a scene, and one merged Gaussian per cell, before the network."""
 
     scene: GaussianScene
     merged: GaussianScene
     partition: Partition
     neighbors: Int[Tensor, "m k"]
     visibility: Float[Tensor, "n"]
-    radius: float
+    radius: float  # of the robust frame of the scene
 
 
 def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> MergedScene:
@@ -73,21 +70,13 @@ def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> Me
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Case:
-    """A scene simplified to a ratio without a network, and the descriptors of its cells.
-
-    Attributes:
-        scene_name: Name of the scene.
-        ratio: Share of Gaussians kept.
-        reference: Scene, merged Gaussians, cells, neighbours, visibility.
-        cells: ``(r,)`` cells of several members, which the network corrects.
-        descriptors: Input of the network for these cells, for images of ``IMAGE_SIZE``.
-    """
+    """A scene simplified to a ratio without a network, and the descriptors of its cells."""
 
     scene_name: str
-    ratio: float
+    ratio: float  # share of Gaussians kept
     reference: MergedScene
-    cells: Int[Tensor, "r"]
-    descriptors: Descriptors
+    cells: Int[Tensor, "r"]  # of several members, which the network corrects
+    descriptors: Descriptors  # of these cells, for images of ``IMAGE_SIZE``
 
     @property
     def name(self) -> str:
@@ -199,13 +188,7 @@ def make_case(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TargetViews:
-    """Images of a full scene, without a background.
-
-    Attributes:
-        cameras: Their cameras.
-        rgb: ``(c, h, w, 3)`` colours over black, half precision.
-        alpha: ``(c, h, w)`` opacity, half precision.
-    """
+    """Images of a full scene over black, and their accumulated alpha, in half precision."""
 
     cameras: Cameras
     rgb: Float[Tensor, "c h w 3"]

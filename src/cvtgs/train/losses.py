@@ -239,13 +239,7 @@ def _random_color(rng: random.Random, case: Case) -> Float[Tensor, "3"]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CellGrid:
-    """Cells side by side in the tiles of one image.
-
-    Attributes:
-        members: All members.
-        corrected: The corrected merged Gaussians.
-        camera: Camera that sees all of them.
-    """
+    """Cells side by side in the tiles of one image, before and after merging."""
 
     members: GaussianScene
     corrected: GaussianScene

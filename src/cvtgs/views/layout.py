@@ -179,34 +179,19 @@ _LARGEST = 1e14
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SceneLayout:
-    """Position, extent and orientation of the content of a scene.
+    """Position, extent and orientation of the content of a scene, float64, in scene units."""
 
-    Attributes:
-        sample: The scene, or a sample of it that covers the same area; SH degree 0, on the CPU.
-        frame: Robust centre and radius of the visible Gaussians.
-        sized: Positions and sizes of Gaussians of the sample.
-        voxels: The surfaces near the middle.
-        up: Up direction, unit length, float64.
-        bounded: Whether nearly all content is within about three robust radii: an object, not a
-            place.
-        center: Middle of the content that views should show, scene units, float64.
-        radius: Radius of the content that views should show, scene units.
-        height: Extent along ``up`` of the content near the middle, scene units.
-        floor: Height of the floor along ``up``, scene units; None without a floor.
-        room: Eye point in the middle of a room; None if the scene is not seen from inside.
-    """
-
-    sample: GaussianScene
+    sample: GaussianScene  # covers the same area as the scene; SH degree 0, on the CPU
     sized: SizedPoints
-    frame: RobustFrame
-    voxels: Voxels
-    up: Float[Tensor, "3"]
-    bounded: bool
-    center: Float[Tensor, "3"]
-    radius: float
-    height: float
-    floor: float | None
-    room: Float[Tensor, "3"] | None
+    frame: RobustFrame  # of the visible Gaussians
+    voxels: Voxels  # the surfaces near the middle
+    up: Float[Tensor, "3"]  # unit length
+    bounded: bool  # nearly all is within about three robust radii: an object, not a place
+    center: Float[Tensor, "3"]  # middle of the content that views should show
+    radius: float  # of this content
+    height: float  # extent along ``up`` of the content near the middle
+    floor: float | None  # height along ``up``; None without a floor
+    room: Float[Tensor, "3"] | None  # eye point in its middle; None if not seen from inside
 
     @property
     def subject(self) -> Float[Tensor, "3"]:

@@ -85,17 +85,11 @@ def score_cameras(
 
 
 class SplatSizes(NamedTuple):
-    """Median sizes of the Gaussians in images, weighted by their contributions.
+    """Median sizes of the Gaussians in images, weighted by their contributions, float64."""
 
-    Attributes:
-        in_image: ``(c,)`` projected standard deviations as a share of the image, float64.
-        in_scene: ``(c,)`` standard deviations as a share of the robust radius, float64.
-        finest: ``(c,)`` their lower decile instead of the median.
-    """
-
-    in_image: Float[Tensor, "c"]
-    in_scene: Float[Tensor, "c"]
-    finest: Float[Tensor, "c"]
+    in_image: Float[Tensor, "c"]  # projected standard deviations, as a share of the image
+    in_scene: Float[Tensor, "c"]  # standard deviations, as a share of the robust radius
+    finest: Float[Tensor, "c"]  # their lower decile instead of the median
 
 
 def splat_sizes(layout: SceneLayout, cameras: Cameras) -> SplatSizes:

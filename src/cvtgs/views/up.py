@@ -62,17 +62,11 @@ _SKY_WEIGHT = 0.6
 
 
 class Voxels(NamedTuple):
-    """Points on the surfaces of a scene; each represents about the same area.
+    """Points on the surfaces of a scene; each represents about the same area."""
 
-    Attributes:
-        points: ``(v, 3)`` mean positions, in robust radii from the middle, float64.
-        normals: ``(v, 3)`` mean thinnest axes of the Gaussians in each voxel, unit length.
-        log_sizes: ``(v,)`` mean log scales of the Gaussians in each voxel.
-    """
-
-    points: Float[Tensor, "v 3"]
-    normals: Float[Tensor, "v 3"]
-    log_sizes: Float[Tensor, "v"]
+    points: Float[Tensor, "v 3"]  # mean positions, in robust radii from the middle, float64
+    normals: Float[Tensor, "v 3"]  # mean thinnest axes of the Gaussians, unit length
+    log_sizes: Float[Tensor, "v"]  # mean log scales of the Gaussians
 
 
 def voxelize(scene: GaussianScene, frame: RobustFrame) -> Voxels:
@@ -127,17 +121,11 @@ class _Plane(NamedTuple):
 
 
 class Floor(NamedTuple):
-    """The level on which most columns of voxels end.
+    """The level on which most columns of voxels end."""
 
-    Attributes:
-        height: Height along ``up``, in robust radii from the middle.
-        share: Share of all columns that end on it, reduced if there are voxels beneath it.
-        bare: The same for columns with nothing on the floor.
-    """
-
-    height: float
-    share: float
-    bare: float
+    height: float  # along ``up``, in robust radii from the middle
+    share: float  # of all columns that end on it, reduced if there are voxels beneath it
+    bare: float  # the same for columns with nothing on the floor
 
 
 def find_up(voxels: Voxels, far: Float[Tensor, "k 3"]) -> Float[Tensor, "3"]:
