@@ -27,7 +27,7 @@ import cvtgs
 import cvtgs.rendering
 from benchmarks.measuring import write_file
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.evaluation.scorer import ViewImage, render_view
+from cvtgs.evaluation.scorer import ViewImages, render_views
 from cvtgs.views.layout import find_layout
 
 RINGS = ((8, 10, 14, 2.9), (4, 35, 32, 2.1))
@@ -157,7 +157,7 @@ class FullImages:
     cameras: Cameras
     folder: Path = CACHE
 
-    def images(self) -> Iterator[ViewImage]:
+    def images(self) -> Iterator[ViewImages]:
         """Yield the image of each camera, from disk if it is cached."""
         about_scene = _digest(self.scene)
         for camera in self.cameras.singles():
@@ -167,13 +167,11 @@ class FullImages:
             key.update(f"{camera.width} {camera.height} {any(camera.ignores_tag)}".encode())
             path = self.folder / f"{key.hexdigest()[:32]}.npy"
             if not path.is_file():
-                found = render_view(self.scene, camera)
+                found = render_views(self.scene, camera)
                 pixels = torch.cat([found.rgb, found.alpha[..., None]], dim=3)
                 write_file(path, _npy(pixels.numpy()))
             pixels = torch.from_numpy(np.load(path))
-            yield ViewImage(
-                camera=camera, rgb=pixels[..., :3], alpha=pixels[..., 3], backend="kept"
-            )
+            yield ViewImages(cameras=camera, rgb=pixels[..., :3], alpha=pixels[..., 3])
 
 
 def _digest(scene: cvtgs.GaussianScene) -> bytes:

@@ -37,7 +37,7 @@ from cvtgs.evaluation.scorer import (
     Metrics,
     chosen_metrics,
     mean_of,
-    render_view,
+    render_views,
     scene_scores,
 )
 from cvtgs.views import automatic_views
@@ -191,7 +191,7 @@ def score(small: cvtgs.GaussianScene, full: FullImages, metrics: Metrics) -> Ite
     """Score a simplified scene view by view, over black."""
     background = small.means.new_tensor(BLACK)
     for truth in full.images():
-        image = render_view(small, truth.camera)
+        image = render_views(small, truth.cameras)
         pair = [one.over(background).clamp(0, 1) for one in (image, truth)]
         yield metrics.compare(*pair, alphas=(image.alpha, truth.alpha))
 

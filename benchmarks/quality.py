@@ -216,7 +216,7 @@ class PhotographJudge(NamedTuple):
         color = scene.means.new_tensor(self.background)
         rows = [
             self.metrics.compare(
-                scorers.render_view(scene, camera).over(color).clamp(0, 1),
+                scorers.render_views(scene, camera).over(color).clamp(0, 1),
                 self.photographs[number : number + 1],
             )
             for number, camera in enumerate(self.cameras.singles())

@@ -12,10 +12,11 @@ from torch import Tensor
 import cvtgs
 from cvtgs import GaussianScene
 from cvtgs.config import SimplifyConfig
+from cvtgs.evaluation.scorer import ViewImages
 from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import Architecture, LearnedScene, MergeNet
 from cvtgs.train import DataConfig, History, Source, TrainConfig, TrainFiles, ViewsConfig, train
-from cvtgs.train.cases import Case, TargetViews, make_case, render_views
+from cvtgs.train.cases import Case, make_case, render_targets
 
 needs_matplotlib = pytest.mark.skipif(
     importlib.util.find_spec("matplotlib") is None, reason="matplotlib is optional"
@@ -90,8 +91,8 @@ def some_case(
     return case
 
 
-def some_views(count: int = 600, *, seed: int = 0, size: int = 32) -> TargetViews:
-    return render_views(small_scene(count, seed=seed), 2, size=size, seed=0)
+def some_views(count: int = 600, *, seed: int = 0, size: int = 32) -> ViewImages:
+    return render_targets(small_scene(count, seed=seed), 2, size=size, seed=0)
 
 
 def small_net(seed: int = 0) -> MergeNet:
@@ -125,7 +126,7 @@ def bits_of_case(case: Case) -> dict[str, Any]:
     }
 
 
-def bits_of_views(views: TargetViews) -> dict[str, Any]:
+def bits_of_views(views: ViewImages) -> dict[str, Any]:
     cameras = views.cameras
     modes = cameras.ignores_tag
     return {

@@ -87,7 +87,7 @@ def test_full_scenes_are_rendered_once_and_then_read(file, tmp_path, monkeypatch
 
     first = images()
     assert first[0].shape == (1, 30, 40, 4)
-    monkeypatch.delattr(camera_files, "render_view")
+    monkeypatch.delattr(camera_files, "render_views")
     assert all(torch.equal(one, other) for one, other in zip(first, images(), strict=True))
 
 

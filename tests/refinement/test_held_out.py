@@ -63,7 +63,7 @@ def test_images_are_of_two_sizes(width, side):
         assert {camera.strides for camera in views.heldout} <= {(2,), (6,)}
         shown = replace(views, training=iter(training))
         images = ImageBuffer(full, shown, config=quick(**sizes), seed=0)
-        drawn = [images.draw().camera for _ in training]
+        drawn = [images.draw().cameras for _ in training]
         assert [camera.strides[0] for camera in drawn] == [2 * one.strides[0] for one in training]
         assert {camera.width for camera in drawn} == {side_then // 2}
 
@@ -124,7 +124,7 @@ def test_old_images_leave_the_buffer_in_random_order():
     config = quick(images=4, steps_per_image=2)
     views = RefineViews(heldout=(), training=iter(ring(80).singles()), endless=True)
     images = ImageBuffer(full_scene(50), views, config=config, seed=0)
-    eyes = [tuple(images.draw().camera.centers[0].tolist()) for _ in range(140)]
+    eyes = [tuple(images.draw().cameras.centers[0].tolist()) for _ in range(140)]
     assert images.rendered > 50
     assert not set(eyes[:20]) & set(eyes[100:])
     new = [step for step in range(20, 130) if eyes[step] not in eyes[:step]]

@@ -11,7 +11,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.config import Rates
 from cvtgs.errors import ConfigError
 from cvtgs.evaluation import scorer as scorer_module
-from cvtgs.evaluation.scorer import BLACK, WHITE, Metrics, Scorer, ViewImage, render_view
+from cvtgs.evaluation.scorer import BLACK, WHITE, Metrics, Scorer, ViewImages, render_views
 from cvtgs.math import parameters
 from cvtgs.refinement import RefineConfig
 from cvtgs.refinement import images as images_module
@@ -136,12 +136,11 @@ def test_large_images_are_scaled_down_and_tiny_ones_up(width, height, size):
     assert camera.Ks[0, 0, 2].item() == pytest.approx(size[0] / 2)
 
 
-def flat_image(value: float, alpha: float) -> ViewImage:
-    return ViewImage(
-        camera=ring(1),
+def flat_image(value: float, alpha: float) -> ViewImages:
+    return ViewImages(
+        cameras=ring(1),
         rgb=torch.full((1, 24, 32, 3), value),
         alpha=torch.full((1, 24, 32), alpha),
-        backend="none",
     )
 
 
@@ -155,12 +154,12 @@ def test_scores_by_hand(monkeypatch):
     """A Gaussian behind the camera paints nothing: black over black, white over white."""
     blind = random_scene(1).with_tensors({"means": torch.tensor([[0.0, 0.0, -90.0]])}, {})
 
-    def scores(*truths: ViewImage) -> torch.Tensor:
+    def scores(*truths: ViewImages) -> torch.Tensor:
         full = full_scene(1)
         with monkeypatch.context() as patch:
-            patch.setattr(scorer_module, "render_view", lambda *_: next(images))
+            patch.setattr(scorer_module, "render_views", lambda *_: next(images))
             images = iter(truths)
-            cameras = [image.camera for image in truths]
+            cameras = [image.cameras for image in truths]
             metrics = Metrics(ssim=False, most_psnr=60.0)
             scorer = Scorer(full, cameras, metrics=metrics, backgrounds=(BLACK, WHITE))
         return heldout_psnr(blind, scorer)
@@ -193,10 +192,10 @@ def test_images_are_rendered_when_needed_and_reused(endless):
         drawn.append(images.draw())
         taken.append(images.rendered)
     assert taken == [1, 1, 1, 2, 2, 2, 3, 3, 3, 3, 3, 3]
-    eyes = [tuple(image.camera.centers[0].tolist()) for image in drawn]
+    eyes = [tuple(image.cameras.centers[0].tolist()) for image in drawn]
     assert (len(set(eyes[:3])), len(set(eyes[6:]))) == (1, 2)
     assert drawn[0].rgb.dtype == torch.float16
-    exact = render_view(full, drawn[0].camera)
+    exact = render_views(full, drawn[0].cameras)
     torch.testing.assert_close(drawn[0].rgb.float(), exact.rgb, rtol=1e-3, atol=1e-3)
 
 
@@ -204,7 +203,7 @@ def test_first_steps_get_new_images_and_all_images_recur():
     config = quick(first_images=8, steps_per_image=100)
     views = RefineViews(heldout=(), training=iter(ring(8).singles()), endless=True)
     images = ImageBuffer(full_scene(50), views, config=config, seed=0)
-    eyes = [tuple(images.draw().camera.centers[0].tolist()) for _ in range(8 + 64)]
+    eyes = [tuple(images.draw().cameras.centers[0].tolist()) for _ in range(8 + 64)]
     assert images.rendered == len(set(eyes[:8])) == 8
     # An image recurs after at least half of the others were used, and not much later.
     for eye in set(eyes):
@@ -219,13 +218,13 @@ def test_the_pixels_of_a_step_equal_those_of_the_whole_image():
     cameras = ring(1, width=47, height=33)
     views = RefineViews(heldout=(), training=iter([cameras]), endless=False)
     images = ImageBuffer(full, views, config=quick(stride=3), seed=0)
-    whole = render_view(full, cameras).rgb
+    whole = render_views(full, cameras).rgb
     seen = set()
     for _ in range(40):
         found = images.draw()
         column, row = (
             round(3 * float(0.5 - shift) - 0.5)
-            for shift in found.camera.Ks[0, :2, 2] - cameras.Ks[0, :2, 2] / 3
+            for shift in found.cameras.Ks[0, :2, 2] - cameras.Ks[0, :2, 2] / 3
         )
         seen.add((column, row))
         torch.testing.assert_close(
@@ -271,12 +270,12 @@ def test_observed_images_come_first_and_every_eighth_is_held_out():
     assert [config.new_images(steps, given=14) for steps in (14, 49, 50, 100)] == [0, 0, 1, 2]
     assert images.rendered == 1
     given = {tuple(camera.viewmats.flatten().tolist()) for camera in observed.cameras.singles()}
-    known = [tuple(image.camera.viewmats.flatten().tolist()) in given for image in drawn]
+    known = [tuple(image.cameras.viewmats.flatten().tolist()) in given for image in drawn]
     assert known == [True] * 49 + [False]
-    assert {image.camera.strides for image in drawn} == {(2,)}
-    held = {tuple(image.camera.viewmats.flatten().tolist()) for image in views.heldout_images}
-    assert not held & {tuple(image.camera.viewmats.flatten().tolist()) for image in drawn}
-    exact = render_view(full, drawn[0].camera)
+    assert {image.cameras.strides for image in drawn} == {(2,)}
+    held = {tuple(image.cameras.viewmats.flatten().tolist()) for image in views.heldout_images}
+    assert not held & {tuple(image.cameras.viewmats.flatten().tolist()) for image in drawn}
+    exact = render_views(full, drawn[0].cameras)
     torch.testing.assert_close(drawn[0].rgb.float(), exact.rgb, rtol=1e-3, atol=1e-3)
 
 
@@ -288,7 +287,7 @@ def test_no_view_is_searched_before_it_is_needed(monkeypatch):
         observed, full, None, config=quick(steps_per_image=9), seed=0
     )
     images = ImageBuffer(full, views, config=quick(steps_per_image=9), seed=0)
-    assert [images.draw().camera.strides for _ in range(8)] == [()] * 8
+    assert [images.draw().cameras.strides for _ in range(8)] == [()] * 8
     with pytest.raises(TypeError):
         images.draw()
 

@@ -13,7 +13,7 @@ from cvtgs.errors import OutputError
 from cvtgs.tags import ANTIALIASED
 from cvtgs.train import Source, TrainConfig, ViewsConfig
 from cvtgs.train.cache import prepare_scene
-from cvtgs.train.cases import make_case, render_views
+from cvtgs.train.cases import make_case, render_targets
 from train_cases import (
     bits_of_case,
     bits_of_views,
@@ -103,7 +103,7 @@ def test_cached_results_equal_fresh_ones(source, made, tmp_path):
             fresh = make_case("made", made.scene, ratio, SimplifyConfig())
             assert bits_of_case(case) == bits_of_case(fresh)
         for place, (size, views) in enumerate(zip((32, 40), prepared.views, strict=True)):
-            fresh = render_views(made.scene, 4, size=size, seed=place)
+            fresh = render_targets(made.scene, 4, size=size, seed=place)
             assert bits_of_views(views) == bits_of_views(fresh)
             assert set(views.cameras.ignores_tag) == {True, False}
 

@@ -5,10 +5,11 @@ import torch
 
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
+from cvtgs.evaluation.scorer import ViewImages
 from cvtgs.math.frames import robust_frame
 from cvtgs.mergenet import correct_cells
 from cvtgs.rendering import render
-from cvtgs.train.cases import TargetViews, make_case, merge_scene, render_views
+from cvtgs.train.cases import make_case, merge_scene, render_targets
 from cvtgs.views import automatic_views, mixed_views, random_views
 from mergenet_cases import fields_of, lively_net
 from scenes import random_scene, same_bits
@@ -135,14 +136,14 @@ def test_the_same_scene_gives_the_same_bits():
     assert bits_of_case(first) == bits_of_case(again)
 
 
-def numbered_views(size: int = 8) -> TargetViews:
+def numbered_views(size: int = 8) -> ViewImages:
     """One image whose red encodes the column and whose green encodes the row."""
     steps = torch.arange(size, dtype=torch.float16)
     rgb = torch.zeros(1, size, size, 3, dtype=torch.float16)
     rgb[..., 0], rgb[..., 1] = steps, steps[:, None]
     intrinsics = torch.tensor([[[10.0, 0, size / 2], [0, 10.0, size / 2], [0, 0, 1]]])
     cameras = Cameras(viewmats=torch.eye(4)[None], Ks=intrinsics, width=size, height=size)
-    return TargetViews(cameras=cameras, rgb=rgb, alpha=rgb[..., 0] / 10)
+    return ViewImages(cameras=cameras, rgb=rgb, alpha=rgb[..., 0] / 10)
 
 
 def test_images_over_a_background():
@@ -156,7 +157,7 @@ def test_images_over_a_background():
 @pytest.mark.slow
 def test_one_image_keeps_its_camera():
     scene = small_scene()
-    views = render_views(scene, 3, size=32, seed=2)
+    views = render_targets(scene, 3, size=32, seed=2)
     one = views.select(1)
     assert torch.equal(one.rgb[0], views.rgb[1])
     assert torch.equal(one.alpha[0], views.alpha[1])
@@ -167,7 +168,7 @@ def test_one_image_keeps_its_camera():
 @pytest.mark.slow
 def test_views_are_mixed_ones():
     scene = small_scene()
-    views = render_views(scene, 5, size=32, seed=2)
+    views = render_targets(scene, 5, size=32, seed=2)
     mixed = mixed_views(scene, 5, size=32, seed=2, sharp=False)
     assert torch.equal(views.cameras.viewmats, mixed.viewmats)
     assert torch.equal(views.cameras.Ks, mixed.Ks)
@@ -182,14 +183,14 @@ def test_views_are_mixed_ones():
 def test_one_view_is_an_automatic_one():
     scene = small_scene()
     usual = automatic_views(scene, 1, width=32, height=32, seed=0)
-    views = render_views(scene, 1, size=32, seed=0)
+    views = render_targets(scene, 1, size=32, seed=0)
     assert torch.equal(views.cameras.viewmats, usual.viewmats)
 
 
 @pytest.mark.slow
 def test_the_seed_decides_the_views():
     scene = small_scene()
-    first, again, other = (render_views(scene, 2, size=32, seed=seed) for seed in (0, 0, 1))
+    first, again, other = (render_targets(scene, 2, size=32, seed=seed) for seed in (0, 0, 1))
     assert bits_of_views(first) == bits_of_views(again)
     assert not torch.equal(first.cameras.viewmats, other.cameras.viewmats)
 

@@ -10,12 +10,12 @@ import torch
 
 import cvtgs
 from cvtgs.evaluation import psnr
-from cvtgs.evaluation.scorer import MOST_PSNR
+from cvtgs.evaluation.scorer import MOST_PSNR, ViewImages
 from cvtgs.losses import image_loss
 from cvtgs.rendering import Rendering, render
 from cvtgs.tags import ANTIALIASED
 from cvtgs.train import LossConfig
-from cvtgs.train.cases import TargetViews, render_views
+from cvtgs.train.cases import render_targets
 from cvtgs.train.losses import local_loss, scene_loss, validation_psnr, view_loss
 from cvtgs.views import mixed_views
 from mergenet_cases import lively_net
@@ -32,13 +32,13 @@ def images() -> tuple[torch.Tensor, torch.Tensor]:
     return target + 0.1 * torch.randn(1, 16, 20, 3, generator=g), target
 
 
-def views_by(change: Callable[[torch.Tensor, torch.Tensor], object]) -> TargetViews:
+def views_by(change: Callable[[torch.Tensor, torch.Tensor], object]) -> ViewImages:
     """Views of 4,000 Gaussians by cameras changed in place."""
     scene = small_scene(4000)
     cameras = mixed_views(scene, 2, size=32, seed=0)
     change(cameras.viewmats, cameras.Ks)
     images = render(scene, cameras)
-    return TargetViews(cameras=cameras, rgb=images.rgb.half(), alpha=images.alpha.half())
+    return ViewImages(cameras=cameras, rgb=images.rgb.half(), alpha=images.alpha.half())
 
 
 def test_a_known_loss():
@@ -140,7 +140,7 @@ def test_half_of_the_images_of_a_tagged_scene_ignore_the_tag(tagged, share, monk
         )
 
     monkeypatch.setattr("cvtgs.train.losses.render", watched)
-    case, views = some_case(), render_views(small_scene(), 4, size=32, seed=0)
+    case, views = some_case(), render_targets(small_scene(), 4, size=32, seed=0)
     merged = replace(case.reference.merged, comments=(ANTIALIASED.text,) if tagged else ())
     case = replace(case, reference=case.reference._replace(merged=merged))
     assert sum(views.cameras.ignores_tag) == 1

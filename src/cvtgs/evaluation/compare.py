@@ -21,10 +21,11 @@ from cvtgs.evaluation.scorer import (
     SceneScores,
     check_seen,
     chosen_metrics,
-    render_view,
+    render_views,
     scene_scores,
 )
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
+from cvtgs.rendering import choose_backend
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.text import shown
 
@@ -274,16 +275,15 @@ def _score_images(
     (reference_name, reference), *_ = scenes.items()
     against_full: dict[str, list[ImageScores]] = {name: [] for name in scenes}
     against_photographs: dict[str, list[ImageScores]] = {name: [] for name in scenes}
-    total, done, backend = len(cameras) * len(scenes), 0, ""
+    total, done = len(cameras) * len(scenes), 0
     check_seen(reference, cameras, name=reference_name, backend=settings.backend)
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
     for view, camera in enumerate(cameras.singles()):
         truth: tuple[Tensor, Tensor] | None = None
         for name, scene in scenes.items():
-            rendered = render_view(scene, camera, backend=settings.backend)
-            backend = rendered.backend
-            color = rendered.over(scene.means.new_tensor(settings.background)).clamp(0, 1)
-            alpha = rendered.alpha
+            image = render_views(scene, camera, backend=settings.backend)
+            color = image.over(scene.means.new_tensor(settings.background)).clamp(0, 1)
+            alpha = image.alpha
             keep(name, view, color, alpha)
             if truth is None:
                 truth = color, alpha
@@ -302,7 +302,7 @@ def _score_images(
         views=cameras.view_names,
         width=cameras.width,
         height=cameras.height,
-        backend=backend,
+        backend=choose_backend(settings.backend, reference.device)[0],
         lpips_network=metrics.lpips.network if metrics.lpips else None,
         lpips_note=metrics.note,
         scenes=tuple(

@@ -187,16 +187,15 @@ def _is_color(value: Sequence[float]) -> bool:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ViewImage:
-    """One image of a scene over black, its accumulated alpha, and the backend that rendered it."""
+class ViewImages:
+    """Images of a scene over black, and their accumulated alpha."""
 
-    camera: Cameras
-    rgb: Float[Tensor, "1 h w 3"]
-    alpha: Float[Tensor, "1 h w"]
-    backend: str
+    cameras: Cameras
+    rgb: Float[Tensor, "c h w 3"]
+    alpha: Float[Tensor, "c h w"]
 
-    def over(self, background: Float[Tensor, "3"]) -> Float[Tensor, "1 h w 3"]:
-        """Composite the image over a background, in the dtype of the background."""
+    def over(self, background: Float[Tensor, "3"]) -> Float[Tensor, "c h w 3"]:
+        """Composite the images over a background, in the dtype of the background."""
         rgb, alpha = self.rgb.to(background.dtype), self.alpha.to(background.dtype)
         return rgb + (1 - alpha)[..., None] * background
 
@@ -205,23 +204,36 @@ class ViewImage:
         column, row = first
         return replace(
             self,
-            camera=self.camera.every(stride, first=first),
+            cameras=self.cameras.every(stride, first=first),
             rgb=self.rgb[:, row::stride, column::stride],
             alpha=self.alpha[:, row::stride, column::stride],
         )
 
+    def select(self, row: int) -> Self:
+        """Return one of the images."""
+        rows = torch.full((1,), row, device=self.cameras.Ks.device)  # no copy to the device
+        part = slice(row, row + 1)
+        return replace(
+            self, cameras=self.cameras.select(rows), rgb=self.rgb[part], alpha=self.alpha[part]
+        )
+
     def half(self) -> Self:
-        """Return the image in half precision."""
+        """Return the images in half precision."""
         return replace(self, rgb=self.rgb.half(), alpha=self.alpha.half())
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the images on a device."""
+        cameras = self.cameras.to(device)
+        return replace(self, cameras=cameras, rgb=self.rgb.to(device), alpha=self.alpha.to(device))
 
 
 @torch.no_grad()
-def render_view(
-    scene: GaussianScene, camera: Cameras, *, backend: BackendName = "auto"
-) -> ViewImage:
-    """Render one view of a scene, without gradients."""
-    found = render(scene, camera, backend=backend)
-    return ViewImage(camera=camera, rgb=found.rgb, alpha=found.alpha, backend=found.backend)
+def render_views(
+    scene: GaussianScene, cameras: Cameras, *, backend: BackendName = "auto"
+) -> ViewImages:
+    """Render views of a scene, without gradients."""
+    found = render(scene, cameras, backend=backend)
+    return ViewImages(cameras=cameras, rgb=found.rgb, alpha=found.alpha)
 
 
 def check_seen(
@@ -230,7 +242,7 @@ def check_seen(
     """Raise if no camera sees anything of a scene."""
     if cameras.shows_any(scene.means):
         return
-    images = (render_view(scene, camera, backend=backend) for camera in cameras.singles())
+    images = (render_views(scene, camera, backend=backend) for camera in cameras.singles())
     if not any(float(image.alpha.mean()) >= LEAST_COVER for image in images):
         raise InvalidArgumentError(
             f"the cameras must see {name}, found nothing of it in any of {len(cameras)} "
@@ -323,7 +335,7 @@ class Scorer:
         cameras: Iterable[Cameras],
         *,
         metrics: Metrics,
-        images: Iterable[ViewImage] = (),
+        images: Iterable[ViewImages] = (),
         backgrounds: Sequence[Color] = (BLACK,),
         progress: Callable[[int], None] = lambda done: None,
     ) -> None:
@@ -332,8 +344,8 @@ class Scorer:
         self._truths: list[tuple[Cameras, _OverBackgrounds]] = []
         for camera in cameras:
             progress(len(self._truths))
-            self._truths.append((camera, self._composite(render_view(full, camera))))
-        self._truths += [(image.camera, self._composite(image)) for image in images]
+            self._truths.append((camera, self._composite(render_views(full, camera))))
+        self._truths += [(image.cameras, self._composite(image)) for image in images]
         progress(len(self._truths))
 
     def __len__(self) -> int:
@@ -343,7 +355,7 @@ class Scorer:
         """Score a scene, view by view and over every background."""
         scores = []
         for camera, truths in self._truths:
-            images = self._composite(render_view(scene, camera))
+            images = self._composite(render_views(scene, camera))
             alphas = (images.alpha, truths.alpha.to(images.alpha))
             scores += [
                 self._metrics.compare(image, truth, alphas=alphas)
@@ -351,7 +363,7 @@ class Scorer:
             ]
         return scores
 
-    def _composite(self, image: ViewImage) -> "_OverBackgrounds":
+    def _composite(self, image: ViewImages) -> "_OverBackgrounds":
         colors = [image.over(background).clamp(0, 1) for background in self._backgrounds]
         return _OverBackgrounds(colors, image.alpha)
 

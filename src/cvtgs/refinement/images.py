@@ -11,7 +11,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.config import RefineConfig
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.evaluation.scorer import ViewImage, render_view
+from cvtgs.evaluation.scorer import ViewImages, render_views
 from cvtgs.losses import SSIM_WINDOW
 from cvtgs.rendering import ObservedViews
 from cvtgs.scene import GaussianScene
@@ -30,8 +30,8 @@ class RefineViews:
     heldout: tuple[Cameras, ...]  # single cameras of one size
     training: Iterator[Cameras]  # single cameras
     endless: bool  # whether ``training`` never ends
-    heldout_images: tuple[ViewImage, ...] = ()  # further held-out views, already rendered
-    images: tuple[ViewImage, ...] = ()  # rendered before the first step; steps see all pixels
+    heldout_images: tuple[ViewImages, ...] = ()  # further held-out views, already rendered
+    images: tuple[ViewImages, ...] = ()  # rendered before the first step; steps see all pixels
 
 
 def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> RefineViews:
@@ -79,12 +79,8 @@ def shared_views(
     seed: int,
 ) -> RefineViews:
     """Split existing images like :func:`split_views`; further training views are new ones."""
-    images = [
-        ViewImage(camera=camera, rgb=rgb[None], alpha=alpha[None], backend=observed.backend)
-        for camera, rgb, alpha in zip(
-            observed.cameras.singles(), observed.rgb, observed.alpha, strict=True
-        )
-    ]
+    whole = ViewImages(cameras=observed.cameras, rgb=observed.rgb, alpha=observed.alpha)
+    images = [whole.select(row) for row in range(len(observed.cameras))]
     held = _heldout_rows(len(images), config)
     return RefineViews(
         heldout=(),
@@ -151,7 +147,7 @@ class ImageBuffer:
         self._drawn = len(self._kept)
         self.rendered = 0
 
-    def draw(self) -> ViewImage:
+    def draw(self) -> ViewImages:
         """Return a training image, in half precision."""
         self._drawn += 1
         later = self._drawn - self._first
@@ -163,7 +159,7 @@ class ImageBuffer:
         else:
             if len(self._kept) == self._capacity:
                 self._kept.pop(self._rng.randrange(len(self._kept)))
-            self._kept.append((render_view(self._full, camera).half(), self._config.stride))
+            self._kept.append((render_views(self._full, camera).half(), self._config.stride))
             self.rendered += 1
         image, stride = self._kept[-1]
         if stride == 1:

@@ -141,7 +141,7 @@ def optimize(
         limits.begin()
         # A random background, because a wrong opacity is visible over some colors.
         target, background = images.draw(), images.draw_background()
-        image = render(optimizer.scene(), target.camera, background=background).rgb
+        image = render(optimizer.scene(), target.cameras, background=background).rgb
         loss = relative_loss(
             image,
             target.over(background),

@@ -14,14 +14,15 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Descriptors, Partition
 from cvtgs.config import SimplifyConfig
+from cvtgs.evaluation.scorer import ViewImages
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.scene import GaussianScene
 from cvtgs.tags import ANTIALIASED
-from cvtgs.train.cases import Case, MergedScene, TargetViews, make_case, render_views
+from cvtgs.train.cases import Case, MergedScene, make_case, render_targets
 from cvtgs.train.config import TrainConfig
 from cvtgs.train.sources import Source
 
-Content = TypeVar("Content", TargetViews, Case)
+Content = TypeVar("Content", ViewImages, Case)
 
 CACHE_VERSION = 9
 """Part of every cache key; increment it when the meaning of the content changes."""
@@ -32,7 +33,7 @@ class TrainingScene:
     """The data of one scene."""
 
     name: str
-    views: tuple[TargetViews, ...]  # one entry per size of images
+    views: tuple[ViewImages, ...]  # one entry per size of images
     cases: tuple[Case, ...]  # the scene at several ratios
 
 
@@ -53,7 +54,7 @@ def prepare_scene(source: Source, config: TrainConfig, folder: Path) -> Training
     views = _cached(
         folder / f"{source.name}-views-{_key(source, sizes, count, seen_from)}.safetensors",
         lambda: _packed_views(
-            render_views(scene(), count, size=size, seed=config.seed + number, file=file)
+            render_targets(scene(), count, size=size, seed=config.seed + number, file=file)
             for number, size in enumerate(sizes)
         ),
         _unpacked_views,
@@ -86,7 +87,7 @@ def _cached(
     return unpack(map_tensors(path)[0])
 
 
-def _packed_views(all_views: Iterable[TargetViews]) -> dict[str, Tensor]:
+def _packed_views(all_views: Iterable[ViewImages]) -> dict[str, Tensor]:
     tensors: dict[str, Tensor] = {}
     for number, views in enumerate(all_views):
         tensors |= {
@@ -99,7 +100,7 @@ def _packed_views(all_views: Iterable[TargetViews]) -> dict[str, Tensor]:
     return tensors
 
 
-def _unpacked_views(tensors: Mapping[str, Tensor]) -> tuple[TargetViews, ...]:
+def _unpacked_views(tensors: Mapping[str, Tensor]) -> tuple[ViewImages, ...]:
     found = []
     for entry in _entries(tensors):
         rgb = entry["rgb"]
@@ -110,7 +111,7 @@ def _unpacked_views(tensors: Mapping[str, Tensor]) -> tuple[TargetViews, ...]:
             height=rgb.shape[1],
             ignores_tag=tuple(entry["ignores_tag"].tolist()),
         )
-        found.append(TargetViews(cameras=cameras, rgb=rgb, alpha=entry["alpha"]))
+        found.append(ViewImages(cameras=cameras, rgb=rgb, alpha=entry["alpha"]))
     return tuple(found)
 
 

@@ -16,6 +16,7 @@ from cvtgs.cells import Descriptors, Partition, describe_cells
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import target_count
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.evaluation.scorer import ViewImages, render_views
 from cvtgs.filters import filter_rows
 from cvtgs.grouping import allocate, collect_cells, tessellate_rows, weigh_rows
 from cvtgs.io import load_cameras
@@ -23,7 +24,6 @@ from cvtgs.mergenet import MergeNet, Net, Residuals, compose
 from cvtgs.mergenet.apply import compose_published
 from cvtgs.mergenet.published import describe_published
 from cvtgs.pipeline import merge_and_inflate
-from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import check_rows
 from cvtgs.views import mixed_views
@@ -186,35 +186,7 @@ def make_case(
     return describe_case(scene_name, ratio, reference, cells) if len(cells) else None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TargetViews:
-    """Images of a full scene over black, and their accumulated alpha, in half precision."""
-
-    cameras: Cameras
-    rgb: Float[Tensor, "c h w 3"]
-    alpha: Float[Tensor, "c h w"]
-
-    def over(self, background: Float[Tensor, "3"]) -> Float[Tensor, "c h w 3"]:
-        """Return the images over a background."""
-        return self.rgb.float() + (1 - self.alpha.float())[..., None] * background
-
-    def select(self, row: int) -> "TargetViews":
-        """Return one of the images."""
-        rows = torch.full((1,), row, device=self.cameras.Ks.device)  # no copy to the device
-        return TargetViews(
-            cameras=self.cameras.select(rows),
-            rgb=self.rgb[row : row + 1],
-            alpha=self.alpha[row : row + 1],
-        )
-
-    def to(self, device: torch.device) -> "TargetViews":
-        """Return the images on a device."""
-        return TargetViews(
-            cameras=self.cameras.to(device), rgb=self.rgb.to(device), alpha=self.alpha.to(device)
-        )
-
-
-Item = TypeVar("Item", Case, TargetViews)
+Item = TypeVar("Item", Case, ViewImages)
 
 
 class DeviceCopies:
@@ -255,9 +227,9 @@ def _byte_count(value: Any) -> int:
     return sum(map(_byte_count, parts)) if isinstance(value, (tuple, dict)) else 0
 
 
-def render_views(
+def render_targets(
     scene: GaussianScene, count: int, *, size: int, seed: int, file: Path | None = None
-) -> TargetViews:
+) -> ViewImages:
     """Render a full scene from evenly spread cameras of a file, or from mixed views.
 
     Mixed views include blurred ones, as in the training of the shipped networks. About every third
@@ -267,9 +239,4 @@ def render_views(
         cameras = mixed_views(scene, count, size=size, seed=seed, sharp=False)
     else:
         cameras = load_cameras(file).spread(count).fitted(size)
-    cameras = cameras.in_both_modes()
-    with torch.no_grad():
-        images = render(scene, cameras)
-    return TargetViews(
-        cameras=cameras, rgb=images.rgb.cpu().half(), alpha=images.alpha.cpu().half()
-    )
+    return render_views(scene, cameras.in_both_modes()).to("cpu").half()

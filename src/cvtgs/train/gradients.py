@@ -12,15 +12,16 @@ import torch
 from torch import Tensor
 
 from cvtgs.devices import thread_count
+from cvtgs.evaluation.scorer import ViewImages
 from cvtgs.mergenet import Net, PublishedMergeNet
 from cvtgs.processes import LocalWorkers
 from cvtgs.train.cache import prepare_scene
-from cvtgs.train.cases import Case, DeviceCopies, TargetViews
+from cvtgs.train.cases import Case, DeviceCopies
 from cvtgs.train.config import TrainConfig
 from cvtgs.train.losses import local_loss, published_loss, scene_loss
 from cvtgs.train.sources import find_sources
 
-CaseWithViews = tuple[Case, tuple[TargetViews, ...]]
+CaseWithViews = tuple[Case, tuple[ViewImages, ...]]
 
 
 class CaseGradient(NamedTuple):

@@ -16,6 +16,7 @@ from cvtgs.errors import (
     MissingDependencyError,
     TrainingError,
 )
+from cvtgs.evaluation.scorer import ViewImages
 from cvtgs.io import atomic_output
 from cvtgs.io.atomic import make_folder
 from cvtgs.mergenet import (
@@ -30,7 +31,7 @@ from cvtgs.mergenet import (
 from cvtgs.mergenet.checkpoint import build_network
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.train.cache import TrainingScene, prepare_scene
-from cvtgs.train.cases import Case, DeviceCopies, TargetViews
+from cvtgs.train.cases import Case, DeviceCopies
 from cvtgs.train.config import TrainConfig
 from cvtgs.train.gradients import CaseGradient, step_gradients
 from cvtgs.train.losses import validation_psnr
@@ -195,7 +196,7 @@ def _shape(config: TrainConfig) -> Architecture | PublishedArchitecture:
 
 def _prepare_scenes(
     sources: Sequence[Source], config: TrainConfig, cache: Path, listener: ProgressListener
-) -> tuple[list[tuple[Case, tuple[TargetViews, ...]]], list[TrainingScene]]:
+) -> tuple[list[tuple[Case, tuple[ViewImages, ...]]], list[TrainingScene]]:
     cases, validation_scenes = [], []
     for number, source in enumerate(sources):
         listener(ProgressEvent(stage="prepare", done=number, total=len(sources)))

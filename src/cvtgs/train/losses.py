@@ -14,7 +14,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.cells import Partition
 from cvtgs.devices import chunk_length
 from cvtgs.evaluation import psnr
-from cvtgs.evaluation.scorer import MOST_PSNR
+from cvtgs.evaluation.scorer import MOST_PSNR, ViewImages
 from cvtgs.losses import image_loss, relative_loss
 from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.math.segments import segment_ids, true_rows
@@ -23,7 +23,7 @@ from cvtgs.mergenet.apply import compose_published
 from cvtgs.mergenet.published import describe_published
 from cvtgs.rendering import contributions, render
 from cvtgs.scene import GaussianScene
-from cvtgs.train.cases import Case, MergedScene, TargetViews
+from cvtgs.train.cases import Case, MergedScene
 from cvtgs.train.config import LossConfig, TrainConfig
 
 LEAST_PAINTED = 0.02
@@ -46,7 +46,7 @@ TILE_WIDTH = 7.0
 
 
 def scene_loss(
-    net: MergeNet, case: Case, views: TargetViews, *, config: TrainConfig, rng: random.Random
+    net: MergeNet, case: Case, views: ViewImages, *, config: TrainConfig, rng: random.Random
 ) -> Float[Tensor, ""]:
     """Compare random crops of images of the corrected scene, over black or a random background.
 
@@ -69,13 +69,13 @@ def scene_loss(
 class _Shot(NamedTuple):
     """One image of a step: a view, a background, and the crop that is compared."""
 
-    view: TargetViews
+    view: ViewImages
     background: Float[Tensor, "3"]
     rows: slice
     columns: slice
 
     @classmethod
-    def draw(cls, views: TargetViews, side: int, case: Case, rng: random.Random) -> "_Shot":
+    def draw(cls, views: ViewImages, side: int, case: Case, rng: random.Random) -> "_Shot":
         background = _background(rng, case)
         view = views.select(_draw_view(views, case, rng))
         last = max(0, view.cameras.width - side)
@@ -99,7 +99,7 @@ class _Shot(NamedTuple):
         )
 
 
-def _draw_view(views: TargetViews, case: Case, rng: random.Random) -> int:
+def _draw_view(views: ViewImages, case: Case, rng: random.Random) -> int:
     """Draw an image; of a scene tagged ``SplatRenderMode: mip``, one that ignores it half the time.
 
     Otherwise the network would serve viewers that honour the tag at the cost of the others.
@@ -206,7 +206,7 @@ def view_loss(
 
 
 @torch.no_grad()
-def validation_psnr(net: Net, case: Case, views: TargetViews) -> tuple[float, float]:
+def validation_psnr(net: Net, case: Case, views: ViewImages) -> tuple[float, float]:
     """Return the mean PSNR over grey without and with the network, in decibels.
 
     A view counts at most ``MOST_PSNR``: an empty one has infinite PSNR, and no gain could be told.
