@@ -13,14 +13,12 @@ from cvtgs.math.parameters import positive_log
 
 __all__ = ["gradient_loss", "image_loss", "l1_loss", "relative_loss", "ssim_loss"]
 
-SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
-"""Side and standard deviation of the Gaussian window, pixels."""
+SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # side and standard deviation of the Gaussian window, pixels
 
 SSIM_K1, SSIM_K2 = 0.01, 0.03
 """Stabilisers of the comparison of means and of the comparison of contrasts."""
 
-SSIM_WEIGHT = GRADIENT_WEIGHT = 0.2
-"""Weights in the loss of CVT-GS."""
+SSIM_WEIGHT = GRADIENT_WEIGHT = 0.2  # weights in the loss of CVT-GS
 
 SQUARED_FLOOR = 1e-5
 IMAGE_FLOOR = 1e-3
@@ -253,18 +251,18 @@ def _image_loss(
 
 
 def check_pair(
-    prediction: Float[Tensor, "c h w 3"], target: Float[Tensor, "c h w 3"], *, least: int = 1
+    prediction: Tensor, target: Tensor, *, least: int = 1, channels: tuple[int, ...] = (3,)
 ) -> None:
-    """Check that two stacks of images can be compared."""
+    """Check that two stacks of images, or of alpha without channels, can be compared."""
     for images in (prediction, target):
         if not isinstance(images, Tensor) or not images.is_floating_point():
             raise InvalidArgumentError(
                 f"images must be tensors of floats, "
                 f"found {getattr(images, 'dtype', type(images).__name__)}."
             )
-        if images.ndim != 4 or images.shape[-1] != 3 or 0 in images.shape:
+        if images.ndim < 3 or images.shape[3:] != channels or 0 in images.shape:
             raise InvalidArgumentError(
-                f"images must have shape (c, h, w, 3) with nothing empty, "
+                f"images must have shape (c, h, w{', 3' if channels else ''}) with nothing empty, "
                 f"found {tuple(images.shape)}."
             )
     if prediction.shape != target.shape:

@@ -24,26 +24,13 @@ from cvtgs.scene import GaussianScene
 
 __all__ = ["Matched", "cell_contributions", "fit_colors", "match_opacities", "match_views"]
 
-HELDOUT_EVERY = 8
-"""One image in this many is held out; none if there are fewer images."""
-
-LAST_ITERATIONS = 3
-"""Conjugate-gradient iterations on all images, after those without the held-out images."""
-
-FLOOR = 0.02
-"""Share of the median weight that is added to the weights to which the ridge is proportional."""
-
-LEAST_PIXELS = 1.0
-"""Added to actual and target contributions, so that barely visible Gaussians keep their opacity."""
-
-LARGEST_FACTOR = 3.0
-"""Limit of the contribution ratio, and of its inverse, in one round."""
-
-POWER = 0.7
-"""Exponent of the ratio, below 1 so that rounds do not overshoot: neighbours change as well."""
-
-LARGEST_DEPTH = 6.0
-"""No change raises an optical depth above this."""
+HELDOUT_EVERY = 8  # one image in this many is held out; none if there are fewer images
+LAST_ITERATIONS = 3  # of conjugate gradients on all images, after those without the held-out ones
+FLOOR = 0.02  # share of the median weight that is added to those that the ridge is proportional to
+LEAST_PIXELS = 1.0  # added to contributions, so that barely visible Gaussians keep their opacity
+LARGEST_FACTOR = 3.0  # limit of the contribution ratio, and of its inverse, in one round
+POWER = 0.7  # of the ratio, below 1 so that rounds do not overshoot: neighbours change as well
+LARGEST_DEPTH = 6.0  # no change raises an optical depth above this
 
 
 class LinearView(NamedTuple):
@@ -198,12 +185,12 @@ class LeastSquares:
         direction, old = scaled, _dots(residual, scaled)
         for _ in range(iterations):
             image = self._product(direction)
-            length = _divided(old, _dots(direction, image)).to(found.dtype)
+            length = parameters.divide(old, _dots(direction, image)).to(found.dtype)
             found = found + length * direction
             residual = residual - length * image
             scaled = self._inverse * residual
             new = _dots(residual, scaled)
-            direction = scaled + _divided(new, old).to(found.dtype) * direction
+            direction = scaled + parameters.divide(new, old).to(found.dtype) * direction
             old = new
         return found
 
@@ -216,10 +203,6 @@ class LeastSquares:
 
 def _dots(one: Float[Tensor, "m k 3"], other: Float[Tensor, "m k 3"]) -> Float[Tensor, "3"]:
     return (one.double() * other.double()).sum(dim=(0, 1))
-
-
-def _divided(above: Float[Tensor, "3"], below: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    return torch.where(below > 0, above / below.clamp_min(1e-300), 0.0)
 
 
 class Matched(NamedTuple):

@@ -29,11 +29,8 @@ from cvtgs.rendering import choose_backend
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.text import shown
 
-STAGE = "evaluate"
-"""Stage name in progress events; one step per image."""
-
-ROUNDING = 1e-3
-"""Values of photographs may be outside [0, 1] by this much, as in half precision."""
+STAGE = "evaluate"  # stage name in progress events; one step per image
+ROUNDING = 1e-3  # values of photographs may be outside [0, 1] by this much, as in half precision
 
 Images = UInt8[np.ndarray, "c h w 3"]
 Alphas = UInt8[np.ndarray, "c h w"]

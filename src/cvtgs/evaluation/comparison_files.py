@@ -41,13 +41,11 @@ STAGE = "write pages"
 _PAPER, _INK, _FADED = (250, 250, 249), (28, 28, 30), (110, 110, 115)
 _LONGEST_TILE, _SHEET_WIDTH = 360, 2800
 _GAP, _MARGIN, _SIDE, _HEAD, _FOOT = 8, 28, 260, 44, 84
-_COLUMN = 90
-"""Smallest width of a column, which its caption needs, and longer side of a reduced image."""
+_COLUMN = 90  # least width of a column, for its caption, and longer side of a reduced image
 _RAMP, _APART = (340, 14), 100
 _NAME, _TEXT = 20, 15
 
-MOST_BYTES = 7_500_000
-"""Size limit of a page; to meet it, images are compressed more and then made smaller."""
+MOST_BYTES = 7_500_000  # of a page; to meet it, images are compressed more, then made smaller
 _TRIES = ((84, 1.0), (72, 1.0), (55, 1.0), (55, 0.7), (45, 0.5), (35, 0.35), (30, 0.25))
 
 

@@ -25,8 +25,7 @@ from cvtgs.io.files import is_folder
 
 Encoding = Literal["png", "webp"]
 
-ERROR_SCALE = 0.3
-"""Difference from which on the brightest colour is used."""
+ERROR_SCALE = 0.3  # difference from which on the brightest colour is used
 
 # Ten steps of "magma" (van der Walt and Smith 2015, CC0), which is perceptually uniform.
 _MAGMA = (
@@ -42,8 +41,7 @@ _MAGMA = (
     (252, 253, 191),
 )
 
-ALPHA_SCALE = 0.2
-"""Absolute difference of alpha from which on the brightest colours are used."""
+ALPHA_SCALE = 0.2  # absolute difference of alpha from which on the brightest colours are used
 
 # Warm where more of the background shows through, black where equal, cold where less shows.
 _ALPHA = (

@@ -5,9 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.devices import without_autocast
-from cvtgs.errors import InvalidArgumentError
 from cvtgs.losses import SSIM_WINDOW, check_pair, mean_ssim
-from cvtgs.text import shown
 
 
 @torch.no_grad()
@@ -119,19 +117,7 @@ def _alpha_differences(
     a: Float[Tensor, "c h w"], b: Float[Tensor, "c h w"]
 ) -> Float[Tensor, "c h w"]:
     """Check two images of alpha and return ``a - b`` in float64."""
-    for images in (a, b):
-        is_tensor = isinstance(images, Tensor)
-        if not is_tensor or images.ndim != 3 or 0 in images.shape or not images.is_floating_point():
-            found = f"{images.dtype} of shape {tuple(images.shape)}" if is_tensor else shown(images)
-            raise InvalidArgumentError(
-                f"images of alpha must be tensors of floats of shape (c, h, w) with nothing empty, "
-                f"found {found}."
-            )
-    if a.shape != b.shape or a.dtype != b.dtype or a.device != b.device:
-        raise InvalidArgumentError(
-            f"both stacks of alpha must share shape, dtype and device, found {a.dtype} of shape "
-            f"{tuple(a.shape)} on {a.device} and {b.dtype} of shape {tuple(b.shape)} on {b.device}."
-        )
+    check_pair(a, b, channels=())
     return a.clamp(0, 1).double() - b.clamp(0, 1).double()
 
 

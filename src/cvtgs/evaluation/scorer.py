@@ -18,8 +18,7 @@ from cvtgs.rendering import BackendName, render
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
 
-NOT_ASKED_FOR = "not asked for"
-"""Note for LPIPS that was not requested, which needs no explanation."""
+NOT_ASKED_FOR = "not asked for"  # note for LPIPS that was not requested, which needs no explanation
 
 LpipsChoice = Literal["auto", "vgg", "alex", "off"]
 """``auto``: VGG if its weights are available, else Alex, else none."""
@@ -28,8 +27,7 @@ Color = tuple[float, float, float]
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
-MOST_PSNR = 60.0
-"""Upper limit of PSNR where scores are compared, dB: closer images count as equal."""
+MOST_PSNR = 60.0  # upper limit of PSNR where scores are compared, dB: closer images count as equal
 
 LEAST_COVER = 1e-4
 """Mean alpha that one image must reach if all Gaussian centres are outside every image."""
@@ -341,11 +339,12 @@ class Scorer:
     ) -> None:
         self._metrics = metrics
         self._backgrounds = [full.means.new_tensor(color) for color in backgrounds]
-        self._truths: list[tuple[Cameras, _OverBackgrounds]] = []
+        self._truths: list[tuple[Cameras, list[Tensor], Tensor]] = []
         for camera in cameras:
             progress(len(self._truths))
-            self._truths.append((camera, self._composite(render_views(full, camera))))
-        self._truths += [(image.cameras, self._composite(image)) for image in images]
+            self._keep(render_views(full, camera))
+        for image in images:
+            self._keep(image)
         progress(len(self._truths))
 
     def __len__(self) -> int:
@@ -354,22 +353,17 @@ class Scorer:
     def score(self, scene: GaussianScene) -> list[ImageScores]:
         """Score a scene, view by view and over every background."""
         scores = []
-        for camera, truths in self._truths:
-            images = self._composite(render_views(scene, camera))
-            alphas = (images.alpha, truths.alpha.to(images.alpha))
+        for camera, colors, alpha in self._truths:
+            image = render_views(scene, camera)
+            alphas = (image.alpha, alpha.to(image.alpha))
             scores += [
-                self._metrics.compare(image, truth, alphas=alphas)
-                for image, truth in zip(images.colors, truths.colors, strict=True)
+                self._metrics.compare(color, truth, alphas=alphas)
+                for color, truth in zip(self._over_all(image), colors, strict=True)
             ]
         return scores
 
-    def _composite(self, image: ViewImages) -> "_OverBackgrounds":
-        colors = [image.over(background).clamp(0, 1) for background in self._backgrounds]
-        return _OverBackgrounds(colors, image.alpha)
+    def _keep(self, truth: ViewImages) -> None:
+        self._truths.append((truth.cameras, self._over_all(truth), truth.alpha))
 
-
-class _OverBackgrounds(NamedTuple):
-    """An image over each background, and its alpha."""
-
-    colors: list[Float[Tensor, "1 h w 3"]]
-    alpha: Float[Tensor, "1 h w"]
+    def _over_all(self, image: ViewImages) -> list[Float[Tensor, "1 h w 3"]]:
+        return [image.over(background).clamp(0, 1) for background in self._backgrounds]

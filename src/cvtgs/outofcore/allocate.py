@@ -25,8 +25,7 @@ from cvtgs.outofcore.job import SENT_BYTES, Job
 from cvtgs.outofcore.rows import BlockRows, send_rows
 from cvtgs.outofcore.visibility import read_apparent_rows
 
-KEY = 1 << 32
-"""The global key of a cell or group is its block times this, plus its number in the block."""
+KEY = 1 << 32  # a global key of a cell or group is its block times this, plus its number there
 
 
 def cell_parts(
@@ -63,7 +62,9 @@ def allocate(job: Job) -> None:
     if is_done and job.path("targets.json").exists():
         return
     manifest = job.read_manifest()
-    cell_counts = _cell_counts(job)
+    cell_counts = [0] * job.blocks  # after Lloyd, which moves some to other blocks
+    for block in job.blocks_with_sites():
+        cell_counts[block] = _own_count(job.read("parts", block))
     regions = _regions(cell_counts, job.cell_room)
     if len(regions) > 1:
         warn(
@@ -93,14 +94,6 @@ def _regions(counts: Sequence[int], room: int) -> list[list[int]]:
                 held = count
             regions[-1].append(block)
     return regions
-
-
-def _cell_counts(job: Job) -> list[int]:
-    """Return the number of cells in each block after Lloyd, which moves some to other blocks."""
-    counts = [0] * job.blocks
-    for block in job.blocks_with_sites():
-        counts[block] = _own_count(job.read("parts", block))
-    return counts
 
 
 def _own_count(parts: Mapping[str, Tensor]) -> int:

@@ -30,14 +30,12 @@ from cvtgs.report import SimplifyReport
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-MAX_DEATHS = 5
-"""Number of rounds in which workers may die with a task before it is given up."""
+MAX_DEATHS = 5  # number of rounds in which workers may die with a task before it is given up
 
 ANSWER_SECONDS = 30.0
 """Seconds in which a scheduler must answer, a first worker appear, or a worker answer a check."""
 
-_SHARE_SECONDS = 10.0
-"""Seconds that a shared disk may take to show a new file to a worker."""
+_SHARE_SECONDS = 10.0  # seconds that a shared disk may take to show a new file to a worker
 
 
 def simplify_distributed(

@@ -12,8 +12,7 @@ from cvtgs.cvt import NearestSite
 from cvtgs.cvt.nearest import nearest_several
 from cvtgs.outofcore.job import Job, Step
 
-RUN = 1 << 9
-"""Number of consecutive balls whose common box is tested before the single balls."""
+RUN = 1 << 9  # number of consecutive balls whose common box is tested before the single balls
 
 
 class OtherBlock(NamedTuple):

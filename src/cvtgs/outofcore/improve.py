@@ -28,20 +28,11 @@ from cvtgs.report import MatchReport, RefineReport
 from cvtgs.scene import GaussianScene, concatenate
 from cvtgs.views import find_view_positions, mixed_views
 
-NEAR = 0.5
-"""Camera positions depend on Gaussians around a block up to this share of its diagonal away."""
-
-SHOWS_BLOCK = 0.1
-"""A camera is used for a block if it shows this share of the pixels that the best one shows."""
-
-MOST_SHOWN = 0.01
-"""Largest share of an image that one Gaussian counts for in this."""
-
-LEAST_CAMERAS = 2
-"""A refinement trains with one camera at least, and holds out another."""
-
-LATER_SEED = 307
-"""Added to the seed, so that views for refinement differ from those for matching."""
+NEAR = 0.5  # camera positions depend on Gaussians up to this share of a block's diagonal away
+SHOWS_BLOCK = 0.1  # share of the pixels of the best camera from which one is used for a block
+MOST_SHOWN = 0.01  # largest share of an image that one Gaussian counts for in this
+LEAST_CAMERAS = 2  # a refinement trains with one camera at least, and holds out another
+LATER_SEED = 307  # added to the seed, so that views for refinement differ from those for matching
 
 
 class Drawn(NamedTuple):

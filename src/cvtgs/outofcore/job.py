@@ -32,8 +32,7 @@ from cvtgs.outofcore.memory import CELL_ROOM
 from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, write_scan
 from cvtgs.processes import Workers
 
-SENT_BYTES = "sent_bytes"
-"""Entry of the label file of a block: bytes of the file of its sent rows."""
+SENT_BYTES = "sent_bytes"  # entry of the label file of a block: bytes of the file of its sent rows
 
 
 FILES_VERSION = 5

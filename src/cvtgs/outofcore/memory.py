@@ -25,27 +25,20 @@ BASE_BYTES = LIBRARY_BYTES + 170_000_000
 SMALL_BASE_BYTES = LIBRARY_BYTES + 70_000_000
 """The same with a quarter of the sample, for less memory than ``ROOMY_BYTES``."""
 
-ROOMY_BYTES = LIBRARY_BYTES + 220_000_000
-"""With less memory than this, the sample is small."""
+ROOMY_BYTES = LIBRARY_BYTES + 220_000_000  # with less memory than this, the sample is small
 
 LEAST_BYTES = LIBRARY_BYTES + 120_000_000
 """Minimum memory of a run in blocks: the small base and a small block."""
 
-IMAGE_BYTES = 400_000_000
-"""Memory reserved for images of the scene and their intermediate data."""
+IMAGE_BYTES = 400_000_000  # memory reserved for images of the scene and their intermediate data
 
 CELL_BYTES = 1500
 """Bytes per cell while pairs of cells merge; some 1,030 were measured, and 220 more with twelve
 components of view-dependent colour."""
 
-MERGING_BYTES = 230
-"""The same in one piece, beyond what rows take in other stages."""
-
-CELL_ROOM = 1 << 20
-"""Number of cells that may merge together if no memory is given."""
-
-SHARED_BY = 4
-"""The number of blocks is a multiple of this, so that two or four workers end at the same time."""
+MERGING_BYTES = 230  # the same in one piece, beyond what rows take in other stages
+CELL_ROOM = 1 << 20  # number of cells that may merge together if no memory is given
+SHARED_BY = 4  # divides the number of blocks, so that two or four workers end at the same time
 
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 

@@ -25,8 +25,7 @@ from cvtgs.progress import silent
 from cvtgs.report import CellStatistics, MatchReport, RefineReport
 from cvtgs.scene import GaussianScene
 
-EXTRA = "extra/"
-"""Prefix of extra columns in files of tensors."""
+EXTRA = "extra/"  # prefix of extra columns in files of tensors
 
 
 class BlockReport(CellStatistics):

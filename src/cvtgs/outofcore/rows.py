@@ -19,8 +19,7 @@ from cvtgs.scene import GaussianScene
 AREA, VISIBILITY, CELL = "cvtgs_apparent_area", "cvtgs_visibility", "cvtgs_cell"
 """Columns of block files in addition to those of the source."""
 
-MAPPED_ROWS = 1 << 14
-"""Number of rows that are mapped and released together."""
+MAPPED_ROWS = 1 << 14  # number of rows that are mapped and released together
 
 
 class BlockRows(NamedTuple):

@@ -52,8 +52,7 @@ from cvtgs.views import find_own_cameras
 RANGE_ROWS, MOST_RANGES = 1 << 18, 64
 """Minimum rows of the file that one process reads in one call; maximum number of such calls."""
 
-SAMPLED = 10_000
-"""Number of Gaussians that tell whether cameras look at the scene."""
+SAMPLED = 10_000  # number of Gaussians that tell whether cameras look at the scene
 
 
 @on_host()

@@ -104,14 +104,9 @@ def _weighted_quantile(coordinates: Tensor, weights: Tensor, share: float) -> fl
     return middle if middle > float(low) else float(high)
 
 
-SAMPLE_ROWS = 1 << 18
-"""Size of the sample from which frame, effect plan and partition are computed."""
-
-CHUNK = 1 << 15
-"""Number of rows that are read together."""
-
-MAPPED_ROWS = 1 << 15
-"""Number of rows of the file that are mapped together while a sample is read."""
+SAMPLE_ROWS = 1 << 18  # size of the sample from which frame, effect plan and partition are computed
+CHUNK = 1 << 15  # number of rows that are read together
+MAPPED_ROWS = 1 << 15  # number of rows of the file that are mapped together while a sample is read
 
 
 class RowRange(NamedTuple):

@@ -250,19 +250,14 @@ def _adopt(job: Job, files: Iterable[SortedFile]) -> None:
     for path in job.path("").glob("rows_*"):
         path.unlink()  # from an earlier sort with another filter
     for file in adopted:
-        try:
-            found = job.path(file.attempt).stat().st_size
-        except OSError as error:
+        path = job.path(file.attempt)
+        found = f"{path.stat().st_size} bytes" if path.exists() else "no file"
+        if found != f"{file.size} bytes":
             raise RunError(
-                f"{job.path(file.attempt)}: a worker reported that it wrote this file, but it is "
-                f"not here; every worker must see the output folder under the same path."
-            ) from error
-        if found != file.size:
-            raise RunError(
-                f"{job.path(file.attempt)}: must have the {file.size} bytes that were "
-                f"written, found {found}; check the disk, and run the same command again."
+                f"{path}: must have the {file.size} bytes that a worker wrote, found {found}; "
+                "every worker must see the output folder under the same path; check the disk, too."
             )
-        replace_file(job.path(file.attempt), job.path(file.name))
+        replace_file(path, job.path(file.name))
     for path in job.path("").glob("attempt_*"):
         path.unlink(missing_ok=True)
     facts = {file.name: (file.size, file.checksum) for file in adopted}

@@ -20,8 +20,7 @@ from cvtgs.outofcore.rows import BlockRows, read_rows
 from cvtgs.rendering import contributions
 from cvtgs.scene import GaussianScene, concatenate
 
-MEASURED = "measured.json"
-"""File of the sums over all blocks."""
+MEASURED = "measured.json"  # file of the sums over all blocks
 
 SCENE = "scene/"
 

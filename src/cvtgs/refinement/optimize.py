@@ -30,36 +30,28 @@ STAGE = "refine"
 
 _LARGEST = 1e18
 
-THINNEST = 0.1
-"""Axes thinner than this share of the mean axis count as this thick, as they do in images."""
-
-MOST_CONCENTRATED = 0.75
-"""So a changed Gaussian that represents only one other still moves, at a quarter of the length."""
-
-MARKING = ("log_scales", "logit_opacities", "sh0")
-"""What tells Gaussians at one position apart."""
+THINNEST = 0.1  # axes below this share of the mean axis count as this thick, as in images
+MOST_CONCENTRATED = 0.75  # so a changed Gaussian that represents only one other moves at a quarter
+MARKING = ("log_scales", "logit_opacities", "sh0")  # what tells Gaussians at one position apart
 
 _BETAS = (0.6, 0.99)
 
 _LEAST_ROOT = 1e-15
 
 
-def check_limits(seconds: float | None, *, steps: int | None) -> None:
-    """Raise an error if seconds or steps are not positive."""
-    if seconds is not None and not 0 < real_number(seconds) < math.inf:
-        raise InvalidArgumentError(
-            f"the refinement time in seconds must be above 0 and finite, found {seconds!r}."
-        )
-    if steps is not None and whole_number(steps) < 1:
-        raise InvalidArgumentError(
-            f"the number of refinement steps must be a whole number of at least 1, found {steps!r}."
-        )
-
-
 class Limits:
     """Counters of steps and seconds, which decide whether one more step fits."""
 
     def __init__(self, seconds: float | None, *, steps: int | None) -> None:
+        if seconds is not None and not 0 < real_number(seconds) < math.inf:
+            raise InvalidArgumentError(
+                f"the refinement time in seconds must be above 0 and finite, found {seconds!r}."
+            )
+        if steps is not None and whole_number(steps) < 1:
+            raise InvalidArgumentError(
+                f"the number of refinement steps must be a whole number of at least 1, found "
+                f"{steps!r}."
+            )
         self._start = time.perf_counter()
         self._last = self._start
         self._seconds = None if seconds is None else float(seconds)  # also one of numpy
@@ -356,8 +348,8 @@ def _nearest_or_equal(full: GaussianScene, small: GaussianScene) -> Int[Tensor, 
 def _marks(scene: GaussianScene) -> Float[Tensor, "n"]:
     """Return a number for every Gaussian, the same only for equal ones; copies are numbered."""
     marks = torch.zeros_like(scene.logit_opacities, dtype=torch.float64)
-    columns = (column for name in MARKING for column in _flat(scene, name).unbind(1))
-    for number, column in enumerate(columns):
+    values = torch.cat([getattr(scene, name).reshape(len(scene), -1) for name in MARKING], dim=1)
+    for number, column in enumerate(values.unbind(1)):
         finite = column.double().clamp(-1e9, 1e9)  # opacity logits may be infinite
         marks += finite * math.sqrt(2 + number)  # incommensurable: sums rarely coincide
     marks %= 1.0
@@ -366,8 +358,3 @@ def _marks(scene: GaussianScene) -> Float[Tensor, "n"]:
         order, ranks = runs
         marks[order] += ranks
     return marks
-
-
-def _flat(scene: GaussianScene, name: str) -> Float[Tensor, "n c"]:
-    values: Tensor = getattr(scene, name)
-    return values.reshape(len(scene), -1)

@@ -13,7 +13,7 @@ from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer, check_seen
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.refinement.images import ImageBuffer, generated_views, shared_views, split_views
-from cvtgs.refinement.optimize import STAGE, Limits, check_limits, learning_rate_scales, optimize
+from cvtgs.refinement.optimize import STAGE, Limits, learning_rate_scales, optimize
 from cvtgs.rendering import ObservedViews
 from cvtgs.rendering.backends import choose_backend
 from cvtgs.rendering.render import check_observed
@@ -23,8 +23,7 @@ from cvtgs.text import shown
 from cvtgs.validity import valid_rows
 from cvtgs.views.positions import checked_seed
 
-DEFAULT_STEPS = 500
-"""Number of steps if neither seconds nor steps are given."""
+DEFAULT_STEPS = 500  # number of steps if neither seconds nor steps are given
 
 
 class Refined(NamedTuple):
@@ -107,7 +106,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     if seconds is None and steps is None:
         seconds = config.seconds or None
         steps = config.steps or (DEFAULT_STEPS if seconds is None else None)
-    check_limits(seconds, steps=steps)
+    limits = Limits(seconds, steps=steps)
     check_whole(frozen, "frozen", least=0, most=len(small), things="Gaussians")
     check_listener(listener)
     if observed is not None:
@@ -119,7 +118,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     if cameras is not None:
         cameras = checked_cameras(cameras).in_both_modes()
         check_seen(theirs, cameras, name="the full scene")
-    limits, clock = Limits(seconds, steps=steps), StageClock(listener, place)
+    clock = StageClock(listener, place)
     # The program may have disabled gradients, or be in inference mode or autocast.
     with (
         threads_for_chunks(),

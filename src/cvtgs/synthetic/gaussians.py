@@ -28,8 +28,7 @@ _SKY_COLOR = (0.55, 0.7, 1.0)
 _BACKING_EVERY = 12
 _HAZE_OPACITY = 0.022
 _MANY_FLOATERS = 1000  # above this count floaters shrink, so that they hide no more of the scene
-_BANDS = (1.0, 0.9, 0.72, 0.5)
-"""Weight of each SH band of a highlight; decreasing weights avoid ringing."""
+_BANDS = (1.0, 0.9, 0.72, 0.5)  # weight of each SH band of a highlight; falling, to avoid ringing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

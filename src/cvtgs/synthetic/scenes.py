@@ -16,11 +16,8 @@ from cvtgs.synthetic.layouts import LAYOUTS, Part
 from cvtgs.synthetic.textures import Random, noise_tile
 from cvtgs.text import shown
 
-KINDS = tuple(LAYOUTS)
-"""The kinds of scenes that can be made."""
-
-_CHUNK = 1 << 15
-"""Rows that are drawn together; this many fit into the cache of one core."""
+KINDS = tuple(LAYOUTS)  # the kinds of scenes that can be made
+_CHUNK = 1 << 15  # rows that are drawn together; this many fit into the cache of one core
 
 
 def scene(kind: str, count: int, *, sh_degree: int = 3, seed: int = 0) -> GaussianScene:

@@ -12,8 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-FACE_STEP = 32.0
-"""Offset between the texture coordinates of consecutive quads."""
+FACE_STEP = 32.0  # offset between the texture coordinates of consecutive quads
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -24,8 +24,7 @@ from cvtgs.train.sources import Source
 
 Content = TypeVar("Content", ViewImages, Case)
 
-CACHE_VERSION = 9
-"""Part of every cache key; increment it when the meaning of the content changes."""
+CACHE_VERSION = 9  # part of every cache key; increment it when the meaning of the content changes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

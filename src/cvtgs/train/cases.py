@@ -28,11 +28,8 @@ from cvtgs.scene import GaussianScene
 from cvtgs.validity import check_rows
 from cvtgs.views import mixed_views
 
-IMAGE_SIZE = 400
-"""Longer side of the images for which the cells of a case are described, pixels."""
-
-DEVICE_BYTES = 10**9
-"""Memory for copies on devices that do not report their free memory, bytes."""
+IMAGE_SIZE = 400  # longer side of the images for which the cells of a case are described, pixels
+DEVICE_BYTES = 10**9  # memory for copies on devices that do not report their free memory, bytes
 
 
 class MergedScene(NamedTuple):

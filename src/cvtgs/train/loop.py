@@ -38,11 +38,8 @@ from cvtgs.train.losses import validation_psnr
 from cvtgs.train.sources import Source, find_sources
 from cvtgs.train.state import Gain, History, TrainState, Validation
 
-WARM_UP = 50
-"""Number of steps in which the learning rate rises."""
-
-LARGEST_GRADIENT = 1.0
-"""Gradients are clipped to this norm."""
+WARM_UP = 50  # number of steps in which the learning rate rises
+LARGEST_GRADIENT = 1.0  # gradients are clipped to this norm
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,7 +167,11 @@ def train(
 
 
 def _first_net(config: TrainConfig) -> Net:
-    shape = _shape(config)
+    shape: Architecture | PublishedArchitecture = Architecture(
+        width=config.width, cell_width=config.cell_width, largest_growth=config.largest_growth
+    )
+    if config.kind == "published":
+        shape = PublishedArchitecture(width=config.width, cell_width=config.cell_width)
     if config.start is not None:
         net = copy.deepcopy(load_checkpoint(config.start).net).requires_grad_(True).train()
         if net.architecture != shape:
@@ -184,14 +185,6 @@ def _first_net(config: TrainConfig) -> Net:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         return build_network(shape)
-
-
-def _shape(config: TrainConfig) -> Architecture | PublishedArchitecture:
-    if config.kind == "published":
-        return PublishedArchitecture(width=config.width, cell_width=config.cell_width)
-    return Architecture(
-        width=config.width, cell_width=config.cell_width, largest_growth=config.largest_growth
-    )
 
 
 def _prepare_scenes(

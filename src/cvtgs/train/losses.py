@@ -26,23 +26,12 @@ from cvtgs.scene import GaussianScene
 from cvtgs.train.cases import Case, MergedScene
 from cvtgs.train.config import LossConfig, TrainConfig
 
-LEAST_PAINTED = 0.02
-"""Contribution from which a step corrects a cell, pixels."""
-
-CHUNK_MEMBERS = 1 << 16
-"""Members and neighbours per chunk of the network in a step."""
-
-BLACK_SHARE = 0.5
-"""Share of the images of whole scenes that have a black background."""
-
-TILE = 32
-"""Side of a tile, which shows one cell, pixels."""
-
-DISTANCE = 50.0
-"""Distance of the camera in image widths, so large that all cells are projected alike."""
-
-TILE_WIDTH = 7.0
-"""Width of a tile in units of the largest standard deviation of its cell, before random zoom."""
+LEAST_PAINTED = 0.02  # contribution from which a step corrects a cell, pixels
+CHUNK_MEMBERS = 1 << 16  # members and neighbours per chunk of the network in a step
+BLACK_SHARE = 0.5  # share of the images of whole scenes that have a black background
+TILE = 32  # side of a tile, which shows one cell, pixels
+DISTANCE = 50.0  # of the camera in image widths, so large that all cells are projected alike
+TILE_WIDTH = 7.0  # in units of the largest standard deviation of its cell, before random zoom
 
 
 def scene_loss(

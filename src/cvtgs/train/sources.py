@@ -20,11 +20,8 @@ from cvtgs.tags import ANTIALIASED
 from cvtgs.train.config import DataConfig
 from cvtgs.validity import valid_part
 
-VALIDATION_SEED = 1_000_000
-"""First seed of generated validation scenes."""
-
-TAGGED = 0.5
-"""Share of the perturbed copies that are tagged ``SplatRenderMode: mip``; few files are."""
+VALIDATION_SEED = 1_000_000  # first seed of generated validation scenes
+TAGGED = 0.5  # share of perturbed copies that are tagged ``SplatRenderMode: mip``; few files are
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,14 +15,9 @@ from cvtgs.scene import GaussianScene
 from cvtgs.validity import valid_part, with_finite_opacities
 from cvtgs.views.up import VOXEL_SIZE, Voxels, among_others, find_floor, find_up, voxelize
 
-ENCLOSED = 0.7
-"""Least share of the upper hemisphere that a room hides from a camera in its middle."""
-
-FREE = 0.12
-"""Clearance that a camera needs, in robust radii."""
-
-_NEAR = 2.2
-"""Surfaces farther away than this, in robust radii, are not walls."""
+ENCLOSED = 0.7  # least share of the upper hemisphere that a room hides from a camera in its middle
+FREE = 0.12  # clearance that a camera needs, in robust radii
+_NEAR = 2.2  # surfaces farther away than this, in robust radii, are not walls
 
 _GROWS = 0.1
 """Least correlation of size and distance of Gaussians in a room: Gaussians behind the surfaces,
@@ -32,8 +27,7 @@ _HIDDEN = 0.18
 """Largest share of the surfaces of a room that is behind others, seen from its middle; about 0.1
 was measured. Hollow objects have outer sides, a base and things beside them: 0.25 and more."""
 
-_BEHIND = 1.3
-"""A surface is behind another in its direction if over this many times as far, plus one voxel."""
+_BEHIND = 1.3  # a surface over this many times as far, plus one voxel, is behind another
 
 _FARTHEST = 6.0
 _MOST_POINTS = 10_000
@@ -163,8 +157,7 @@ def _cells_of_cube(offsets: Float[Tensor, "n 3"]) -> Tensor:
     return cells
 
 
-SAMPLE_SIZE = 30_000
-"""Largest number of Gaussians of a sample; larger scenes are reduced to it."""
+SAMPLE_SIZE = 30_000  # largest number of Gaussians of a sample; larger scenes are reduced to it
 
 _HEAVIEST = 5_000
 _MOST_POSITIONS = 100_000
@@ -173,8 +166,7 @@ _BOUNDED = 3.2
 _FAR = 4.0
 _FAR_SHARE = 0.02
 _HEIGHTS = (0.02, 0.98)
-_LARGEST = 1e14
-"""Units beyond which directions of length 1 vanish beside positions in float64."""
+_LARGEST = 1e14  # units beyond which directions of length 1 vanish beside positions in float64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -13,15 +13,13 @@ from cvtgs.cameras import Cameras
 from cvtgs.errors import CvtgsError, FileFormatError, check_path, warn
 from cvtgs.scene import GaussianScene, check_scene
 
-_LEAST_SEEN = 0.01
-"""A camera looks at a scene if its image contains this share of the visible Gaussians."""
+_LEAST_SEEN = 0.01  # share of the visible Gaussians in the image of a camera that looks at a scene
 
 _LEAST_LOOKING = 0.5
 _MOST_POINTS = 2000
 _VISIBLE = 0.1
 
-_LEAST_TEST = 4
-"""A test split of fewer cameras is not used: their mean would tell little."""
+_LEAST_TEST = 4  # a test split of fewer cameras is not used: their mean would tell little
 
 
 class OwnCameras(NamedTuple):

@@ -34,8 +34,7 @@ from cvtgs.views.scoring import (
     splat_widths,
 )
 
-REACH = (0.2, 3.0)
-"""Range of distances of candidate positions, in robust radii from the centre of the frame."""
+REACH = (0.2, 3.0)  # distances of candidate positions from the centre of the frame, robust radii
 
 _SEEDS = 1 << 32
 _TRIED = 384
@@ -43,26 +42,16 @@ _SEED = 17
 _STANDING_REACH = (0.2, 2.0)
 """Range of level distances of candidate positions in an open place, robust radii."""
 
-_ELEVATIONS = (5.0, 35.0)
-"""Range of angles at which these positions rise from the ground in the middle, degrees."""
-
-_ABOVE = 0.1
-"""Least height above a floor, in robust radii."""
-
-_BURIED = 0.75
-"""A position is inside matter if this share of the upper and of the lower hemisphere is hidden."""
-
-_SLACK = 0.25
-"""Accepted difference from (nearly) the largest growth of all candidates."""
+_ELEVATIONS = (5.0, 35.0)  # angles at which these rise from the ground in the middle, degrees
+_ABOVE = 0.1  # least height above a floor, in robust radii
+_BURIED = 0.75  # share of the upper and of the lower hemisphere that is hidden inside matter
+_SLACK = 0.25  # accepted difference from (nearly) the largest growth of all candidates
 
 _TOP = 0.98
 
 _SIDES = 32
-_OUTSIDE = 1.1
-"""Positions at least this many robust radii away see a side of the scene from outside."""
-
-_SIDE_DISTANCE, _SIDE_FIELD = 2.2, 50.0
-"""Distance of the cameras that check sides, robust radii, and their field of view, degrees."""
+_OUTSIDE = 1.1  # positions this many robust radii away see a side of the scene from outside
+_SIDE_DISTANCE, _SIDE_FIELD = 2.2, 50.0  # of the cameras that check sides: robust radii, degrees
 
 _ASKED = 32
 
@@ -71,11 +60,8 @@ _MEASURED = (16, 64)
 
 _SAMPLE = 60_000
 
-_FEW = 20_000
-"""Scenes of fewer Gaussians are coarse from everywhere."""
-
-_COARSE = 2.0
-"""The finest tenth of an image of clutter is over this many times that of clear images."""
+_FEW = 20_000  # scenes of fewer Gaussians are coarse from everywhere
+_COARSE = 2.0  # the finest tenth of an image of clutter is over this many times that of clear ones
 
 _SUSPECT, _SUSPECTED = 0.03, 0.25
 

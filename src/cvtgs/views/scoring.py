@@ -14,31 +14,23 @@ from cvtgs.rendering import observe, render
 from cvtgs.scene import GaussianScene
 from cvtgs.views.layout import SceneLayout
 
-PIXELS = 64
-"""Longer side of the small images."""
+PIXELS = 64  # longer side of the small images
 
 _SOLID = 0.5
-_NEAR = 0.3
-"""A surface nearer than this share of the distance to the subject is an obstacle."""
+_NEAR = 0.3  # a surface nearer than this share of the distance to the subject is an obstacle
 
 _MOST_NEAR = 0.08
 _MOST_BLOCKED = 0.3
-_LEAST_FILLED = {False: 0.12, True: 0.8}
-"""Least mean alpha, by whether the camera is inside a room."""
+_LEAST_FILLED = {False: 0.12, True: 0.8}  # least mean alpha, by whether the camera is inside a room
 
 _VISIBLE = 0.25
 SMOOTH = 0.05
 """Largest splats of smooth sides that images were taken of, in robust radii. Sampling makes scenes
 of any number of Gaussians comparable."""
 
-_SPARSE = 4
-"""Sizes of splats are measured on every fourth Gaussian of a sample, with four times its area."""
-
-_FEW = 20_000
-"""Samples of fewer Gaussians are used whole."""
-
-_ENCLOSING = 2.5
-"""A camera within this many standard deviations of a Gaussian is inside it."""
+_SPARSE = 4  # splats are measured on every fourth Gaussian of a sample, of four times the area
+_FEW = 20_000  # samples of fewer Gaussians are used whole
+_ENCLOSING = 2.5  # a camera within this many standard deviations of a Gaussian is inside it
 
 
 def cameras_at(
