@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -79,9 +79,8 @@ def encode(image: UInt8[np.ndarray, "h w 3"], encoding: Encoding, *, quality: in
     """Encode an image."""
     from PIL import Image  # noqa: PLC0415 (takes time to load)
 
-    settings: dict[str, Any] = {"png": {}, "webp": {"quality": quality}}[encoding]
     file = io.BytesIO()
-    Image.fromarray(image).save(file, format=encoding, **settings)
+    Image.fromarray(image).save(file, format=encoding, quality=quality)  # PNG ignores it
     return file.getvalue()
 
 

@@ -4,7 +4,6 @@ import math
 import re
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 
@@ -40,17 +39,13 @@ MERGING_BYTES = 230  # the same in one piece, beyond what rows take in other sta
 CELL_ROOM = 1 << 20  # number of cells that may merge together if no memory is given
 SHARED_BY = 4  # divides the number of blocks, so that two or four workers end at the same time
 
-_UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
-
 
 def read_bytes(text: str) -> int:
     """Read an amount of memory in bytes, such as 4GB (powers of 1000) or 1.5 GiB."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([KMGT]?)(I?)B?\s*", text.upper())
     if not match:
         raise InvalidArgumentError(f"memory must be an amount such as 4GB, found {text!r}.")
-    unit = _UNITS[match[2]]
-    if match[3]:
-        unit = 1024 ** " KMGT".index(match[2] or " ")
+    unit = (1024 if match[3] else 1000) ** " KMGT".index(match[2] or " ")
     amount = int(float(match[1]) * unit)
     if amount < LEAST_BYTES:
         raise InvalidArgumentError(
@@ -119,29 +114,23 @@ def control_group_rooms(root: Path) -> list[int]:
     return rooms
 
 
-class _GroupFiles(NamedTuple):
-    """Names of the files of a control group."""
-
-    limit: str
-    usage: str
-    cache: str
-    """Key in ``memory.stat`` of the file pages that the system reclaims first."""
+# Files of limit and use of a control group, and the key in ``memory.stat`` of the file pages that
+# the system reclaims first.
+_VERSION_1 = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+_VERSION_2 = ("memory.max", "memory.current", "inactive_file")
 
 
-_VERSION_1 = _GroupFiles("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
-_VERSION_2 = _GroupFiles("memory.max", "memory.current", "inactive_file")
-
-
-def _room(folder: Path, names: _GroupFiles) -> int | None:
+def _room(folder: Path, names: tuple[str, str, str]) -> int | None:
     """Return the bytes left in a group; None if it has no limit (version 2 writes ``max``)."""
+    limit_file, usage_file, cache = names
     try:
-        limit = int((folder / names.limit).read_text(encoding="ascii"))
-        used = int((folder / names.usage).read_text(encoding="ascii"))
+        limit = int((folder / limit_file).read_text(encoding="ascii"))
+        used = int((folder / usage_file).read_text(encoding="ascii"))
     except (OSError, ValueError):
         return None
     try:
         text = (folder / "memory.stat").read_text(encoding="ascii")
-        used -= int(dict(line.split(maxsplit=1) for line in text.splitlines())[names.cache])
+        used -= int(dict(line.split(maxsplit=1) for line in text.splitlines())[cache])
     except (OSError, ValueError, KeyError):
         pass
     return limit - max(0, used)

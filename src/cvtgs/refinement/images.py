@@ -17,10 +17,8 @@ from cvtgs.rendering import ObservedViews
 from cvtgs.scene import GaussianScene
 from cvtgs.views import find_view_positions, mixed_views
 
-HELDOUT_SEED = 101
-"""Added to the seed, so that held-out views differ from those of evaluations and of training."""
-
-TRAINING_SEED = 211
+# Added to the seed, so that held-out and training views differ, also from those of evaluations.
+HELDOUT_SEED, TRAINING_SEED = 101, 211
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -47,13 +47,11 @@ _INSIDE = (
 )
 OUTSIDE_FIELD = 45.0  # field of view around a scene along the shorter side of the image, degrees
 INSIDE_FIELD = 62.0  # field of view inside a room along the shorter side of the image, degrees
-
 _PLACE_RADIUS = 0.95
 _OBJECT_RADIUS = 1.0
 _INSIDE_PITCH = -10.0
 _PATH_RADIUS = 0.15
 _WALL_QUANTILE = 0.8  # of surface distances, a wall: the nearest are furniture, the farthest stray
-
 _FARTHEST = 1.5
 _FOUND = 2
 

@@ -18,7 +18,6 @@ from cvtgs.views.up import VOXEL_SIZE, Voxels, among_others, find_floor, find_up
 ENCLOSED = 0.7  # least share of the upper hemisphere that a room hides from a camera in its middle
 FREE = 0.12  # clearance that a camera needs, in robust radii
 _NEAR = 2.2  # surfaces farther away than this, in robust radii, are not walls
-
 _GROWS = 0.1
 """Least correlation of size and distance of Gaussians in a room: Gaussians behind the surfaces,
 where no image was taken, are large. In a hollow object, sizes shrink with distance."""
@@ -28,7 +27,6 @@ _HIDDEN = 0.18
 was measured. Hollow objects have outer sides, a base and things beside them: 0.25 and more."""
 
 _BEHIND = 1.3  # a surface over this many times as far, plus one voxel, is behind another
-
 _FARTHEST = 6.0
 _MOST_POINTS = 10_000
 _CELLS = 10
@@ -158,7 +156,6 @@ def _cells_of_cube(offsets: Float[Tensor, "n 3"]) -> Tensor:
 
 
 SAMPLE_SIZE = 30_000  # largest number of Gaussians of a sample; larger scenes are reduced to it
-
 _HEAVIEST = 5_000
 _MOST_POSITIONS = 100_000
 _VISIBLE = 0.1

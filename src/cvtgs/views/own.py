@@ -14,11 +14,9 @@ from cvtgs.errors import CvtgsError, FileFormatError, check_path, warn
 from cvtgs.scene import GaussianScene, check_scene
 
 _LEAST_SEEN = 0.01  # share of the visible Gaussians in the image of a camera that looks at a scene
-
 _LEAST_LOOKING = 0.5
 _MOST_POINTS = 2000
 _VISIBLE = 0.1
-
 _LEAST_TEST = 4  # a test split of fewer cameras is not used: their mean would tell little
 
 

@@ -35,39 +35,26 @@ from cvtgs.views.scoring import (
 )
 
 REACH = (0.2, 3.0)  # distances of candidate positions from the centre of the frame, robust radii
-
 _SEEDS = 1 << 32
 _TRIED = 384
 _SEED = 17
-_STANDING_REACH = (0.2, 2.0)
-"""Range of level distances of candidate positions in an open place, robust radii."""
-
+_STANDING_REACH = (0.2, 2.0)  # level distances of candidates in an open place, robust radii
 _ELEVATIONS = (5.0, 35.0)  # angles at which these rise from the ground in the middle, degrees
 _ABOVE = 0.1  # least height above a floor, in robust radii
 _BURIED = 0.75  # share of the upper and of the lower hemisphere that is hidden inside matter
 _SLACK = 0.25  # accepted difference from (nearly) the largest growth of all candidates
-
 _TOP = 0.98
-
 _SIDES = 32
 _OUTSIDE = 1.1  # positions this many robust radii away see a side of the scene from outside
 _SIDE_DISTANCE, _SIDE_FIELD = 2.2, 50.0  # of the cameras that check sides: robust radii, degrees
-
 _ASKED = 32
-
-_MEASURED = (16, 64)
-"""Numbers of positions to look closely from: first a few, then more where these see clutter."""
-
+_MEASURED = (16, 64)  # positions to look closely from: a few, then more where these see clutter
 _SAMPLE = 60_000
-
 _FEW = 20_000  # scenes of fewer Gaussians are coarse from everywhere
 _COARSE = 2.0  # the finest tenth of an image of clutter is over this many times that of clear ones
-
 _SUSPECT, _SUSPECTED = 0.03, 0.25
-
-_LARGE, _CLUTTERED = 0.015, 0.4
-"""Least size of the finest splats of clutter, robust radii, and least share of such positions."""
-
+_LARGE = 0.015  # least size of the finest splats of clutter, robust radii
+_CLUTTERED = 0.4  # least share of the positions that see such splats
 _FIELD = 50.0
 
 
@@ -326,7 +313,7 @@ def split_by_clutter(
         return eyes, none
     few = eyes[:: -(-len(eyes) // _ASKED)]
     finest = splat_sizes(layout, _facing_middle(layout, few)).finest
-    if not _many(_are_coarse(finest, _SUSPECT), _SUSPECTED):
+    if _are_coarse(finest, _SUSPECT).double().mean() < _SUSPECTED:
         return eyes, none  # the sample, which has larger splats, shows as much
     sample, enlargement = covering_sample(viewable_part(scene), _SAMPLE)
     widths = splat_widths(sample) * torch.exp(-enlargement[:, 0].double())
@@ -334,7 +321,7 @@ def split_by_clutter(
         few = eyes[:: -(-len(eyes) // most)]
         sizes = measure_splats(sample, widths, layout.frame.radius, _facing_middle(layout, few))
         coarse = _are_coarse(sizes.finest, _LARGE)
-        if not _many(coarse, _CLUTTERED):
+        if coarse.double().mean() < _CLUTTERED:
             return eyes, none
     return few[~coarse], few[coarse]
 
@@ -346,7 +333,3 @@ def _facing_middle(layout: SceneLayout, eyes: Float[Tensor, "p 3"]) -> Cameras:
 
 def _are_coarse(finest: Float[Tensor, "p"], least: float) -> Bool[Tensor, "p"]:
     return finest > (_COARSE * finest.quantile(0.1)).clamp_min(least)
-
-
-def _many(mask: Bool[Tensor, "p"], share: float) -> bool:
-    return float(mask.double().mean()) >= share

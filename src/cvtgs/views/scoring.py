@@ -15,14 +15,11 @@ from cvtgs.scene import GaussianScene
 from cvtgs.views.layout import SceneLayout
 
 PIXELS = 64  # longer side of the small images
-
 _SOLID = 0.5
 _NEAR = 0.3  # a surface nearer than this share of the distance to the subject is an obstacle
-
 _MOST_NEAR = 0.08
 _MOST_BLOCKED = 0.3
 _LEAST_FILLED = {False: 0.12, True: 0.8}  # least mean alpha, by whether the camera is inside a room
-
 _VISIBLE = 0.25
 SMOOTH = 0.05
 """Largest splats of smooth sides that images were taken of, in robust radii. Sampling makes scenes

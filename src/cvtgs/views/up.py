@@ -16,7 +16,6 @@ VOXEL_SIZE = 0.1  # edge of a voxel, in robust radii
 _EXTENT = 3.0  # Gaussians farther than this from the middle along an axis, in radii, get no voxel
 _OPAQUE = 0.3  # a voxel is empty if its Gaussians together cover less than this share of a face
 _FAINT_SHARE = 0.1  # in faint scenes, a voxel is empty below this share of the weighted mean cover
-
 _GUESSES = 256
 _REFINED = 24
 _MOST_VOXELS = 6000
@@ -24,25 +23,19 @@ _THICKNESS = VOXEL_SIZE
 _ALIGNED = 0.85
 _LEAST_SCORE = 0.12  # of a ground plane: its share of all voxels times its roundness and width
 
-_USUAL = ((0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_USUAL_EVIDENCE = (0.5, 0.3, 0.3)
-"""Usual up directions of captures, and their weight relative to evidence in the scene."""
-
+_USUAL = ((0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # up directions of captures
+_USUAL_EVIDENCE = (0.5, 0.3, 0.3)  # their weights relative to evidence in the scene
 _USUAL_BONUS = (1.5, 1.5, 1.25)
 _USUAL_COSINE = 0.85
 _SNAP_COSINE = 0.99  # 8 degrees
-
 _COLUMN = 0.15  # width of the columns in which a floor is searched, in robust radii
 _BARE = 0.25  # columns lower than this show a bare floor, in robust radii
-
 _LEVEL = 0.7
 _BENEATH = 3.0  # penalty factor of the share of voxels beneath a floor
 _LEAST_FLOOR = 0.25  # least share of all columns that end on a floor
-
 _GROWTH_WEIGHT = 0.5
 _MOST_GROWTH = 0.4
 _SKY = 0.12  # distant content this far above the middle on average, relative to distance, is a sky
-
 _SKY_WEIGHT = 0.6
 
 
