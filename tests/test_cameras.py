@@ -19,11 +19,13 @@ GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "h
     [
         (
             {"viewmats": torch.eye(3)[None]},
-            "viewmats must be floats of shape (1, 4, 4), found torch.float32 of shape (1, 3, 3).",
+            "viewmats must be a tensor of floats of shape (c, 4, 4), "
+            "found torch.float32 of shape (1, 3, 3).",
         ),
         (
             {"Ks": torch.ones(1, 3, 3, dtype=torch.int64)},
-            "Ks must be floats of shape (1, 3, 3), found torch.int64 of shape (1, 3, 3).",
+            "Ks must be a tensor of floats of shape (1, 3, 3), "
+            "found torch.int64 of shape (1, 3, 3).",
         ),
         (
             {"Ks": torch.eye(3).double()[None]},
@@ -32,7 +34,8 @@ GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "h
         ),
         (
             {"viewmats": torch.eye(4)},
-            "viewmats must be floats of shape (1, 4, 4), found torch.float32 of shape (4, 4).",
+            "viewmats must be a tensor of floats of shape (c, 4, 4), "
+            "found torch.float32 of shape (4, 4).",
         ),
         ({"strides": 5}, "strides must hold one stride per camera, 1; found 5."),
         ({"ignores_tag": 5}, "ignores_tag must hold one choice per camera, 1; found 5."),
@@ -46,7 +49,7 @@ GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "h
         ),
         (
             {"viewmats": torch.eye(4)[None].numpy()},
-            "viewmats must be a torch.Tensor, found ndarray.",
+            "viewmats must be a tensor of floats of shape (c, 4, 4), found ndarray.",
         ),
         ({"names": ("a", "b")}, "names must hold one name per camera, 1; found 2."),
         (
@@ -92,18 +95,18 @@ def test_first_pixels_beyond_the_stride_are_refused(first):
 @pytest.mark.parametrize(
     ("points", "found"),
     [
-        (torch.zeros(3), "torch.float32, (3,)"),
-        (torch.zeros(5, 2), "torch.float32, (5, 2)"),
-        (torch.zeros(5, 3, dtype=torch.int64), "torch.int64, (5, 3)"),
-        (torch.zeros(5, 3).numpy(), "float32, ndarray"),
-        ([[0.0, 0.0, 1.0]], "no floats, list"),
-        (None, "no floats, NoneType"),
+        (torch.zeros(3), "torch.float32 of shape (3,)"),
+        (torch.zeros(5, 2), "torch.float32 of shape (5, 2)"),
+        (torch.zeros(5, 3, dtype=torch.int64), "torch.int64 of shape (5, 3)"),
+        (torch.zeros(5, 3).numpy(), "ndarray"),
+        ([[0.0, 0.0, 1.0]], "list"),
+        (None, "NoneType"),
     ],
 )
 def test_points_of_another_shape_are_refused(points, found):
     with pytest.raises(InvalidArgumentError) as caught:
         Cameras(**GOOD).shows_any(points)
-    assert str(caught.value) == f"points must be a tensor of floats (n, 3), found {found}."
+    assert str(caught.value) == f"points must be a tensor of floats of shape (n, 3), found {found}."
 
 
 def test_every_second_pixel_by_hand():

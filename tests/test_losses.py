@@ -120,7 +120,7 @@ def test_images_smaller_than_the_window_are_refused_by_ssim(size) -> None:
         with pytest.raises(InvalidArgumentError) as error:
             loss(first, second)
         assert str(error.value) == (
-            f"images must have at least 11 x 11 pixels here, found {size[1]} x {size[0]}."
+            f"there must be images of at least 11 x 11 pixels, found 1 of {size[1]} x {size[0]}."
         )
 
 
@@ -142,24 +142,27 @@ ZEROS = torch.zeros(1, 12, 12, 3)
 WRONG = {
     "not floats": (
         (ZEROS.int(), ZEROS),
-        "images must be tensors of floats, found torch.int32.",
+        "the first stack of images must be a tensor of floats of shape (c, h, w, 3), "
+        "found torch.int32 of shape (1, 12, 12, 3).",
     ),
-    "not a tensor": (([0.0], ZEROS), "images must be tensors of floats, found list."),
+    "not a tensor": (
+        ([0.0], ZEROS),
+        "the first stack of images must be a tensor of floats of shape (c, h, w, 3), found list.",
+    ),
     "one image": (
         (ZEROS[0], ZEROS[0]),
-        "images must have shape (c, h, w, 3) with nothing empty, found (12, 12, 3).",
+        "the first stack of images must be a tensor of floats of shape (c, h, w, 3), "
+        "found torch.float32 of shape (12, 12, 3).",
     ),
     "channels first": (
         (ZEROS, ZEROS.permute(0, 3, 1, 2)),
-        "images must have shape (c, h, w, 3) with nothing empty, found (1, 3, 12, 12).",
-    ),
-    "empty": (
-        (ZEROS[:0], ZEROS[:0]),
-        "images must have shape (c, h, w, 3) with nothing empty, found (0, 12, 12, 3).",
+        "the second one must be a tensor of floats of shape (1, 12, 12, 3), "
+        "found torch.float32 of shape (1, 3, 12, 12).",
     ),
     "two shapes": (
         (ZEROS, ZEROS[:, :11]),
-        "both stacks of images must have one shape, found (1, 12, 12, 3) and (1, 11, 12, 3).",
+        "the second one must be a tensor of floats of shape (1, 12, 12, 3), "
+        "found torch.float32 of shape (1, 11, 12, 3).",
     ),
     "two dtypes": (
         (ZEROS, ZEROS.double()),
@@ -176,6 +179,12 @@ def test_error_texts(loss, case) -> None:
     with pytest.raises(InvalidArgumentError) as error:
         loss(*images)
     assert str(error.value) == text
+
+
+@pytest.mark.parametrize("loss", [*LOSSES, relative_loss])
+def test_no_images_are_refused(loss) -> None:
+    with pytest.raises(InvalidArgumentError, match=r"there must be images .*, found 0 of 12 x 12"):
+        loss(ZEROS[:0], ZEROS[:0])
 
 
 def test_weights_out_of_range_are_refused() -> None:

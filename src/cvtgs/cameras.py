@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from cvtgs.checks import check_kinds, checked
 from cvtgs.counts import check_whole, whole_number
 from cvtgs.devices import usable_device, without_autocast
 from cvtgs.errors import InvalidArgumentError
@@ -52,20 +53,11 @@ class Cameras:
     ignores_tag: tuple[bool, ...] = ()
 
     def __post_init__(self) -> None:
-        count = len(self.viewmats) if getattr(self.viewmats, "ndim", 0) == 3 else 1  # a guess
-        for name, tensor, shape in (
-            ("viewmats", self.viewmats, (count, 4, 4)),
-            ("Ks", self.Ks, (count, 3, 3)),
-        ):
-            if not isinstance(tensor, Tensor):
-                raise InvalidArgumentError(
-                    f"{name} must be a torch.Tensor, found {type(tensor).__name__}."
-                )
-            if tuple(tensor.shape) != shape or not tensor.is_floating_point():
-                raise InvalidArgumentError(
-                    f"{name} must be floats of shape {shape}, "
-                    f"found {tensor.dtype} of shape {tuple(tensor.shape)}."
-                )
+        check_kinds(
+            {"viewmats": Float[Tensor, "c 4 4"], "Ks": Float[Tensor, "c 3 3"]},
+            {"viewmats": self.viewmats, "Ks": self.Ks},
+        )
+        count = len(self.viewmats)
         if self.viewmats.device != self.Ks.device or self.viewmats.dtype != self.Ks.dtype:
             raise InvalidArgumentError(
                 f"viewmats and Ks must share device and dtype, found {self.viewmats.dtype} on "
@@ -289,6 +281,7 @@ class Cameras:
         modes = tuple(math.sqrt(2.0) * row % 1.0 < 1 / 3 for row in range(1, len(self) + 1))
         return replace(self, ignores_tag=modes)
 
+    @checked
     def shows_any(self, points: Float[Tensor, "n 3"]) -> bool:
         """Check whether any point lies within any of the images.
 
@@ -301,10 +294,6 @@ class Cameras:
         Raises:
             InvalidArgumentError: ``points`` is no tensor of floats of this shape.
         """
-        shape = tuple(points.shape) if isinstance(points, Tensor) else type(points).__name__
-        if shape[1:] != (3,) or not points.is_floating_point():
-            found = f"{getattr(points, 'dtype', 'no floats')}, {shape}"
-            raise InvalidArgumentError(f"points must be a tensor of floats (n, 3), found {found}.")
         for view, intrinsics in zip(self.viewmats.to(points), self.Ks.to(points), strict=True):
             x, y, depth = intrinsics @ (view[:3, :3] @ points.T + view[:3, 3:])
             inside = (depth > 0) & (x >= 0) & (x <= self.width * depth)

@@ -2,11 +2,13 @@
 
 import math
 from functools import cache
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.checks import check_kinds
 from cvtgs.devices import without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import positive_log
@@ -249,32 +251,19 @@ def _image_loss(
 
 
 def check_pair(
-    prediction: Tensor, target: Tensor, *, least: int = 1, channels: tuple[int, ...] = (3,)
+    prediction: Tensor, target: Tensor, *, least: int = 1, kind: Any = Float[Tensor, "c h w 3"]
 ) -> None:
-    """Check that two stacks of images, or of alpha without channels, can be compared."""
-    for images in (prediction, target):
-        if not isinstance(images, Tensor) or not images.is_floating_point():
-            raise InvalidArgumentError(
-                f"images must be tensors of floats, "
-                f"found {getattr(images, 'dtype', type(images).__name__)}."
-            )
-        if images.ndim < 3 or images.shape[3:] != channels or 0 in images.shape:
-            raise InvalidArgumentError(
-                f"images must have shape (c, h, w{', 3' if channels else ''}) with nothing empty, "
-                f"found {tuple(images.shape)}."
-            )
-    if prediction.shape != target.shape:
-        raise InvalidArgumentError(
-            f"both stacks of images must have one shape, "
-            f"found {tuple(prediction.shape)} and {tuple(target.shape)}."
-        )
+    """Check that two stacks of images of one kind can be compared."""
+    stacks = {"the first stack of images": prediction, "the second one": target}
+    check_kinds(dict.fromkeys(stacks, kind), stacks)
     if prediction.dtype != target.dtype or prediction.device != target.device:
         raise InvalidArgumentError(
             f"both stacks of images must share dtype and device, found {prediction.dtype} on "
             f"{prediction.device} and {target.dtype} on {target.device}."
         )
     height, width = prediction.shape[1:3]
-    if min(height, width) < least:
+    if len(prediction) == 0 or min(height, width) < least:
         raise InvalidArgumentError(
-            f"images must have at least {least} x {least} pixels here, found {width} x {height}."
+            f"there must be images of at least {least} x {least} pixels, found {len(prediction)} "
+            f"of {width} x {height}."
         )

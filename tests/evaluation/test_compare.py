@@ -140,11 +140,11 @@ def test_photographs_are_scored_for_every_scene(scene, small, cameras):
     assert tenth.alpha_bias is None
     assert tenth.psnr.mean < full.psnr.mean < 40
     assert full.psnr.views == pytest.approx(psnr(images, photographs).tolist(), rel=1e-4)
-    with pytest.raises(ValueError, match=r"photographs must have shape \(3, 36, 48, 3\)"):
+    with pytest.raises(ValueError, match=r"photographs must be a .*\(3, 36, 48, 3\), found"):
         evaluate(scene, small, cameras, settings=OFF, photographs=photographs[:2])
     refused = [
-        ((photographs * 255).byte(), r"of floats in \[0, 1\], found Tensor of torch\.uint8"),
-        (photographs.numpy(), r"of floats in \[0, 1\], found ndarray of float32"),
+        ((photographs * 255).byte(), r"a tensor of floats .*, found torch\.uint8"),
+        (photographs.numpy(), r"a tensor of floats .*, found ndarray"),
         (photographs * 255, r"must be in \[0, 1\], found values from 0 to"),
         (photographs * math.nan, r"must be in \[0, 1\], found values from nan to nan"),
     ]

@@ -113,7 +113,9 @@ def test_invalid_arguments_are_refused() -> None:
     images = random_images(30, 40)
     with pytest.raises(InvalidArgumentError) as error:
         lpips(*images, network="alex", weights=random_weights("alex"))
-    assert str(error.value) == "images must have at least 31 x 31 pixels here, found 40 x 30."
+    assert (
+        str(error.value) == "there must be images of at least 31 x 31 pixels, found 1 of 40 x 30."
+    )
     with pytest.raises(InvalidArgumentError) as error:
         lpips(*images, weights=random_weights("alex"))
     assert str(error.value) == (

@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from cvtgs.cameras import Cameras, checked_cameras, spread_rows
+from cvtgs.checks import check_kinds
 from cvtgs.clock import check_listener
 from cvtgs.counts import check_whole
 from cvtgs.errors import InvalidArgumentError
@@ -233,16 +234,8 @@ def _named_scenes(
 
 
 def _check_photographs(photographs: Float[Tensor, "c h w 3"], cameras: Cameras) -> None:
-    if not isinstance(photographs, Tensor) or not photographs.is_floating_point():
-        found = f"{type(photographs).__name__} of {getattr(photographs, 'dtype', 'unknown type')}"
-        raise InvalidArgumentError(
-            f"photographs must be a torch.Tensor of floats in [0, 1], found {found}."
-        )
-    wanted = (len(cameras), cameras.height, cameras.width, 3)
-    if tuple(photographs.shape) != wanted:
-        raise InvalidArgumentError(
-            f"photographs must have shape {wanted}, found {tuple(photographs.shape)}."
-        )
+    shape = f"{len(cameras)} {cameras.height} {cameras.width} 3"
+    check_kinds({"photographs": Float[Tensor, shape]}, {"photographs": photographs})
     low, high = (float(end) for end in photographs.aminmax())
     if not -ROUNDING <= low <= high <= 1 + ROUNDING:
         raise InvalidArgumentError(
@@ -263,8 +256,7 @@ def _score_images(
     """Score all scenes against the first, view by view; pass every image to ``keep``."""
     if len(checked_cameras(cameras)) == 0:
         raise InvalidArgumentError("an evaluation needs at least one camera, found none.")
-    if not isinstance(settings, EvaluationSettings):
-        raise InvalidArgumentError(f"settings must be EvaluationSettings, found {shown(settings)}.")
+    check_kinds({"settings": EvaluationSettings}, {"settings": settings})
     check_listener(listener)
     if photographs is not None:
         _check_photographs(photographs, cameras)

@@ -117,7 +117,7 @@ def _alpha_differences(
     a: Float[Tensor, "c h w"], b: Float[Tensor, "c h w"]
 ) -> Float[Tensor, "c h w"]:
     """Check two images of alpha and return ``a - b`` in float64."""
-    check_pair(a, b, channels=())
+    check_pair(a, b, kind=Float[Tensor, "c h w"])
     return a.clamp(0, 1).double() - b.clamp(0, 1).double()
 
 
