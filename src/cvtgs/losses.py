@@ -16,11 +16,8 @@ from cvtgs.math.parameters import positive_log
 __all__ = ["gradient_loss", "image_loss", "l1_loss", "relative_loss", "ssim_loss"]
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # side and standard deviation of the Gaussian window, pixels
-
 SSIM_K1, SSIM_K2 = 0.01, 0.03  # stabilise the comparisons of means and of contrasts
-
 SSIM_WEIGHT = GRADIENT_WEIGHT = 0.2  # weights in the loss of CVT-GS
-
 SQUARED_FLOOR = 1e-5
 IMAGE_FLOOR = 1e-3  # added to errors before the logarithm, so near-perfect images count less
 

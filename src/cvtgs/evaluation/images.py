@@ -93,15 +93,6 @@ def resized(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> np.ndar
     return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.LANCZOS))
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Read the width and height of an image without decoding its pixels."""
-    from PIL import Image  # noqa: PLC0415
-
-    with _opened(path), Image.open(path) as file:
-        width, height = file.size
-    return width, height
-
-
 def read_image(
     path: Path, size: tuple[int, int], background: tuple[float, float, float]
 ) -> Float[np.ndarray, "h w 3"]:
@@ -241,8 +232,12 @@ def fit_cameras(cameras: Cameras, folder: str | os.PathLike[str]) -> Cameras:
         ...     fit_cameras(cameras, images).width
         8
     """
-    paths = _find_all(Path(folder), cameras)
-    sizes = [image_size(path) for path in paths]
+    from PIL import Image  # noqa: PLC0415
+
+    paths, sizes = _find_all(Path(folder), cameras), []
+    for path in paths:
+        with _opened(path), Image.open(path) as file:  # does not decode the pixels
+            sizes.append(file.size)
     (width, height), _ = Counter(sizes).most_common(1)[0]
     stretches = (cameras.Ks[:, 1, 1] / cameras.Ks[:, 0, 0]).tolist()  # from a size of its own
     for path, (wide, high), stretch in zip(paths, sizes, stretches, strict=True):

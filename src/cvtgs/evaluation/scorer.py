@@ -28,7 +28,6 @@ Color = tuple[float, float, float]
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 MOST_PSNR = 60.0  # upper limit of PSNR where scores are compared, dB: closer images count as equal
-
 LEAST_COVER = 1e-4  # mean alpha that one image must reach if all centres are outside every image
 
 

@@ -18,7 +18,6 @@ from cvtgs.counts import shared_out
 from cvtgs.devices import one_thread
 from cvtgs.errors import warn
 from cvtgs.grouping import REASSIGN, allocation_at
-from cvtgs.io import atomic_output
 from cvtgs.math.segments import segment_argmax, sort_by_label, take_columns
 from cvtgs.outofcore.halo import number_remote
 from cvtgs.outofcore.job import SENT_BYTES, Job
@@ -78,8 +77,7 @@ def allocate(job: Job) -> None:
         found = _allocate_region(job, region, cell_counts, count)
         for block, target in zip(region, found, strict=True):
             targets[block] = target
-    with atomic_output(job.path("targets.json"), overwrite=True) as file:
-        file.write(json.dumps(targets).encode())
+    job.write_file("targets.json", json.dumps(targets).encode())
 
 
 def _regions(counts: Sequence[int], room: int) -> list[list[int]]:

@@ -7,7 +7,7 @@ import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -71,10 +71,8 @@ def simplify_distributed(
     """
     if output is None:
         output = Path(source).with_name(f"{Path(source).stem}_rho{rho:g}.ply")
-    if isinstance(client, str):
-        with connect(client) as found:
-            return simplify_file(source, output, rho, workers=ClusterWorkers(found), **options)
-    return simplify_file(source, output, rho, workers=ClusterWorkers(client), **options)
+    with connect(client) if isinstance(client, str) else nullcontext(client) as found:
+        return simplify_file(source, output, rho, workers=ClusterWorkers(found), **options)
 
 
 def connect(address: str) -> "Client":

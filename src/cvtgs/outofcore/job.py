@@ -118,6 +118,11 @@ class Job:
         """Write the tensors of a step for a block."""
         save_tensors(self.step_path(step, block, iteration), tensors, facts or {})
 
+    def write_file(self, name: str, content: bytes) -> None:
+        """Write a file of the job, completely or not at all."""
+        with atomic_output(self.path(name), overwrite=True) as file:
+            file.write(content)
+
     @property
     def views_path(self) -> Path:
         """The file of the cameras that all blocks share, and of the sample of the scene."""
@@ -197,8 +202,8 @@ class Job:
 
     def write_network(self, checkpoint: Checkpoint) -> None:
         """Write the checkpoint to the folder of the job."""
-        with atomic_output(self.path("network.safetensors"), overwrite=True) as file:
-            file.write(save_checkpoint(checkpoint.net, checkpoint.info))
+        content = save_checkpoint(checkpoint.net, checkpoint.info)
+        self.write_file("network.safetensors", content)
 
     def read_scan(self) -> SceneScan:
         """Read the data of the whole scene that all blocks need."""
@@ -275,8 +280,7 @@ class Job:
 
     def write_manifest(self, manifest: Manifest) -> None:
         """Write the manifest, which marks all rows as sorted."""
-        with atomic_output(self.path("manifest.json"), overwrite=True) as file:
-            file.write(manifest.model_dump_json(indent=2).encode())
+        self.write_file("manifest.json", manifest.model_dump_json(indent=2).encode())
 
     def _is_whole(self, name: str, size: int, checksum: int) -> bool:
         """Return whether a file of rows still has its original size and checksum."""

@@ -18,17 +18,10 @@ LIBRARY_BYTES = 280_000_000 if torch.version.cuda is None else 430_000_000
 """Interpreter, torch and scipy. The CUDA build of torch takes 150 MB more of its own, and maps
 370 MB of libraries, which the system can drop."""
 
-BASE_BYTES = LIBRARY_BYTES + 170_000_000
-"""Libraries, network, sample, grid of depths, and a chunk of rows."""
-
-SMALL_BASE_BYTES = LIBRARY_BYTES + 70_000_000
-"""The same with a quarter of the sample, for less memory than ``ROOMY_BYTES``."""
-
+BASE_BYTES = LIBRARY_BYTES + 170_000_000  # network, sample, grid of depths, a chunk of rows
+SMALL_BASE_BYTES = LIBRARY_BYTES + 70_000_000  # the same with a quarter of the sample
 ROOMY_BYTES = LIBRARY_BYTES + 220_000_000  # with less memory than this, the sample is small
-
-LEAST_BYTES = LIBRARY_BYTES + 120_000_000
-"""Minimum memory of a run in blocks: the small base and a small block."""
-
+LEAST_BYTES = LIBRARY_BYTES + 120_000_000  # of a run in blocks: the small base, a small block
 IMAGE_BYTES = 400_000_000  # memory reserved for images of the scene and their intermediate data
 
 CELL_BYTES = 1500

@@ -13,7 +13,7 @@ from cvtgs.analysis.analyze import select_columns
 from cvtgs.clock import StageClock
 from cvtgs.cvt.nearest import search_name
 from cvtgs.devices import one_thread
-from cvtgs.io import atomic_output, save
+from cvtgs.io import save
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.tensors import add_prefix, under_prefix
 from cvtgs.mergenet import correct_cells
@@ -189,8 +189,7 @@ def write_block(
     """Write a finished block; its report comes first, since the scene file marks it as finished."""
     path = job.improved_path(block) if is_improved else job.small_path(block)
     axes = job.axes if path == job.finished_path(block) else SCENE_AXES
-    with atomic_output(job.report_path(block), overwrite=True) as file:
-        file.write(report.model_dump_json().encode())
+    job.write_file(job.report_path(block).name, report.model_dump_json().encode())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         save(small, path, overwrite=True, axes=axes)

@@ -23,7 +23,6 @@ from cvtgs.config import TessellationConfig
 from cvtgs.devices import one_thread
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError, RunError
 from cvtgs.grouping import finer_count
-from cvtgs.io import atomic_output
 from cvtgs.io.atomic import replace_file, write_error
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.rows import AREA, VISIBILITY, record_type
@@ -261,5 +260,4 @@ def _adopt(job: Job, files: Iterable[SortedFile]) -> None:
     for path in job.path("").glob("attempt_*"):
         path.unlink(missing_ok=True)
     facts = {file.name: (file.size, file.checksum) for file in adopted}
-    with atomic_output(job.path("sorted.json"), overwrite=True) as output:
-        output.write(json.dumps(facts).encode())
+    job.write_file("sorted.json", json.dumps(facts).encode())

@@ -13,7 +13,6 @@ from cvtgs.analysis.analyze import drop_mip_tag, measured_areas, visibility_came
 from cvtgs.boxes import inside
 from cvtgs.cameras import Cameras
 from cvtgs.devices import one_thread
-from cvtgs.io import atomic_output
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.rows import BlockRows, read_rows
@@ -21,7 +20,6 @@ from cvtgs.rendering import contributions
 from cvtgs.scene import GaussianScene, concatenate
 
 MEASURED = "measured.json"  # file of the sums over all blocks
-
 SCENE = "scene/"
 
 
@@ -75,8 +73,7 @@ def add_contributions(job: Job) -> None:
     for block in job.blocks_with_rows():
         tensors = job.read("contributions", block)
         sums = {name: total + float(tensors[name]) for name, total in sums.items()}
-    with atomic_output(job.path(MEASURED), overwrite=True) as file:
-        file.write(json.dumps(sums).encode())
+    job.write_file(MEASURED, json.dumps(sums).encode())
 
 
 def read_apparent_rows(job: Job, block: int, *, is_slim: bool = True) -> BlockRows:

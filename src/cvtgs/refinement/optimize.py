@@ -33,7 +33,6 @@ _LARGEST = 1e18
 THINNEST = 0.1  # axes below this share of the mean axis count as this thick, as in images
 MOST_CONCENTRATED = 0.75  # so a changed Gaussian that represents only one other moves at a quarter
 MARKING = ("log_scales", "logit_opacities", "sh0")  # what tells Gaussians at one position apart
-
 _BETAS = (0.6, 0.99)
 
 _LEAST_ROOT = 1e-15
