@@ -3,7 +3,7 @@
 import math
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import torch
@@ -79,12 +79,11 @@ class _Shot(NamedTuple):
         camera = self.view.cameras
         offset = torch.zeros_like(camera.Ks)
         offset[:, 0, 2], offset[:, 1, 2] = self.columns.start, self.rows.start
-        return Cameras(
-            viewmats=camera.viewmats,
+        return replace(
+            camera,
             Ks=camera.Ks - offset,
             width=min(self.columns.stop, camera.width) - self.columns.start,
             height=min(self.rows.stop, camera.height) - self.rows.start,
-            ignores_tag=camera.ignores_tag,
         )
 
 

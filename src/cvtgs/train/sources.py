@@ -87,17 +87,16 @@ def _from_files(
             make=partial(_load_valid, path),
             cameras=cameras if is_validation and cameras.is_file() else None,
         )
-        if whole.is_validation:
+        if is_validation:
             yield whole
             continue
         originals = [whole] if count <= config.largest_scene else []
         yield from originals
         for number in range(config.blocks if count > config.block_count else 0):
-            block = Source(
-                name=f"{path.stem}-block{number}",
-                identity=f"{whole.identity} block {config.block_count} {seed + number}",
-                is_validation=False,
-                origin=whole.origin,
+            block = replace(
+                whole,
+                name=f"{name}-block{number}",
+                identity=f"{sha256} block {config.block_count} {seed + number}",
                 make=partial(_block_of, whole, config.block_count, seed + number),
             )
             originals.append(block)
@@ -121,11 +120,10 @@ def _copies(originals: list[Source], count: int, seed: int) -> Iterator[Source]:
     for original in originals:
         for number in range(count):
             name = f"{original.name}-copy{number}"
-            yield Source(
+            yield replace(
+                original,
                 name=name,
                 identity=f"{original.identity} copy {seed} {number}",
-                is_validation=False,
-                origin=original.origin,
                 make=partial(_perturbed, original, f"{seed}/{name}"),
             )
 
