@@ -208,9 +208,10 @@ def scan_range(
 
 def add_totals(parts: Iterable[RangeTotals]) -> RangeTotals:
     """Add up the totals of all ranges; the grid of the first is changed in place."""
-    first, *others = parts
-    total, far_masses = first, [first.far_masses]
-    for part in others:
+    rest = iter(parts)  # one after the other: a grid has dozens of megabytes
+    total = next(rest)
+    far_masses = [total.far_masses]
+    for part in rest:
         far_masses.append(part.far_masses)
         total = total._replace(
             depths=total.depths.add_(part.depths),
