@@ -25,14 +25,6 @@ from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.visibility import read_apparent_rows
 
 
-class EmbeddedRows(NamedTuple):
-    """Rows of a block along a Morton curve, with positions in the space of the tessellation."""
-
-    order: Int[Tensor, "n"]
-    points: Float[Tensor, "n d"]
-    weights: Float[Tensor, "n"]
-
-
 class RemoteSums(NamedTuple):
     """Number of each site with points of another block, that block, and weight and sum of these."""
 
@@ -175,8 +167,10 @@ def assign(job: Job, iterations: int, block: int) -> None:
     job.write("parts", block, parts | facts)
 
 
-def _embedded_rows(job: Job, block: int, order: Tensor | None = None) -> EmbeddedRows:
-    """Embed the Gaussians of a block in a given order, or in one computed here."""
+def _embedded_rows(
+    job: Job, block: int, order: Tensor | None = None
+) -> tuple[Int[Tensor, "n"], Float[Tensor, "n d"], Float[Tensor, "n"]]:
+    """Return rows of a block along a Morton curve or in a given order, embedded, and weights."""
     scan = job.read_scan()
     scene, areas, visibility = read_apparent_rows(job, block)
     analysis = SceneAnalysis(
@@ -197,7 +191,7 @@ def _embedded_rows(job: Job, block: int, order: Tensor | None = None) -> Embedde
     config = job.config.cvt
     weights = gaussian_weights(analysis.opacities[rows], areas[rows], config.area_power)
     weights = (weights / scan.mean_weight).clamp_min(config.weight_floor)
-    return EmbeddedRows(order, points, weights)
+    return order, points, weights
 
 
 def _assign(job: Job, iteration: int, block: int, points: Tensor) -> tuple[Tensor, Assignment]:

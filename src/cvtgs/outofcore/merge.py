@@ -46,14 +46,6 @@ class BlockCells(NamedTuple):
     partition: cells.Partition
 
 
-class WithHalo(NamedTuple):
-    """The merged Gaussians of a block, then those of its halo, and their numbers of members."""
-
-    scene: GaussianScene
-    sizes: Int[Tensor, "k"]
-    own_count: int
-
-
 @one_thread()
 def merge(job: Job, block: int) -> None:
     """Merge the members of every cell of a block."""
@@ -77,11 +69,12 @@ def inflate(job: Job, block: int) -> None:
     if job.has("inflated", block):
         return
     own = job.read("merged", block)
+    own_count = len(own["sizes"])
     near = neighbor_count(job.config.merge, with_network=job.has_network)
     numbers = [other for other in job.blocks_with_cells() if other != block]
     others = other_blocks(job, "merged", "means", numbers)
     remote = halo_cells(own["means"], others, count=near)
-    merged, _, own_count = _with_halo(job, "merged", block, remote)
+    merged, _ = _with_halo(job, "merged", block, remote)
     neighbors = cvt.nearest_neighbors(merged.means, near)[:own_count]
     # Only the number of members per cell matters here, so their rows are left out.
     offsets = torch.nn.functional.pad(own["sizes"].cumsum(0), (1, 0))
@@ -104,7 +97,7 @@ def correct(job: Job, block: int) -> None:
     original, scene, visibility, partition = read_cells(job, block)
     own = job.read("inflated", block)
     shown = partition.keep_only(own["representatives"])
-    small, sizes, own_count = _with_halo(job, "inflated", block, own["remote"])
+    small, sizes = _with_halo(job, "inflated", block, own["remote"])
     net = job.read_network(scene.dtype)
     if net is not None:
         small = correct_cells(
@@ -117,7 +110,7 @@ def correct(job: Job, block: int) -> None:
             pixel_size=job.read_scan().frame.radius / job.config.merge.image_size,
             sizes=sizes,
         )
-    tensors = {name: values[:own_count] for name, values in small.tensors().items()}
+    tensors = {name: values[: len(own["sizes"])] for name, values in small.tensors().items()}
     small = scene.with_tensors(tensors, under_prefix(EXTRA, own))
     small = restore_columns(validity.standardized(small), original, job.read_scan().plan)
     report = BlockReport(
@@ -162,8 +155,10 @@ def read_cells(job: Job, block: int) -> BlockCells:
     return BlockCells(rows.scene, scene, rows.visibility, partition)
 
 
-def _with_halo(job: Job, step: Step, block: int, remote: Tensor) -> WithHalo:
-    """Read the merged Gaussians of a block, then the remote ones in the order of their blocks."""
+def _with_halo(
+    job: Job, step: Step, block: int, remote: Tensor
+) -> tuple[GaussianScene, Int[Tensor, "k"]]:
+    """Read the merged Gaussians of a block, then of its halo, and their numbers of members."""
     own = job.read(step, block)
     names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN", "sizes")
     parts = {name: [own[name]] for name in names}
@@ -174,8 +169,7 @@ def _with_halo(job: Job, step: Step, block: int, remote: Tensor) -> WithHalo:
             values.append(tensors[name].index_select(0, numbers))
     tensors = {name: torch.cat(values) for name, values in parts.items()}
     sizes = tensors.pop("sizes")
-    scene = GaussianScene(**tensors, extras={}, comments=(), layout=())
-    return WithHalo(scene, sizes, len(own["sizes"]))
+    return GaussianScene(**tensors, extras={}, comments=(), layout=()), sizes
 
 
 def read_report(job: Job, block: int) -> BlockReport:
