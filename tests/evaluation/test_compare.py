@@ -154,7 +154,10 @@ def test_photographs_are_scored_for_every_scene(scene, small, cameras):
 
 
 def test_evaluate_refuses_invalid_arguments(scene, cameras):
-    for wrong, message in (({"full": scene}, "the name of the full"), (scene, "must be a mapping")):
+    for wrong, message in (
+        ({"full": scene}, "the name of the full"),
+        (scene, "must be of type Mapping"),
+    ):
         with pytest.raises(InvalidArgumentError, match=message):
             evaluate(scene, wrong, cameras, settings=OFF)
     with pytest.raises(ValueError, match="at least one camera"):

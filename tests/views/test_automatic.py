@@ -294,7 +294,7 @@ def test_numbers_of_numpy_are_accepted():
 
 @pytest.mark.parametrize("count", [-1, 1.5, None, True])
 def test_random_views_need_a_whole_number_of_views(count):
-    with pytest.raises(InvalidArgumentError, match=f"at least 0; found {count}"):
+    with pytest.raises(InvalidArgumentError, match=f"at least 0, found {count}"):
         random_views(random_scene(50), count, size=32, seed=0)
 
 

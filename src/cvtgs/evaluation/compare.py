@@ -216,11 +216,7 @@ def compare(  # noqa: PLR0913 (options by name)
 def _named_scenes(
     reference: SceneLike, small: Mapping[str, SceneLike], reference_name: str
 ) -> dict[str, GaussianScene]:
-    if not isinstance(small, Mapping):
-        raise InvalidArgumentError(
-            f"small must be a mapping of names and scenes, such as {{'small': scene}}; found "
-            f"{type(small).__name__}."
-        )
+    check_kinds({"small": Mapping}, {"small": small})
     for name in small:
         if not isinstance(name, str):
             raise InvalidArgumentError(f"names of scenes must be texts, found {shown(name)}.")

@@ -215,16 +215,12 @@ def _draw_legends(sheet: "Image", left: int, top: int, font: "FreeTypeFont | Ima
 
     draw, (width, height) = ImageDraw.Draw(sheet), _RAMP
     steps = np.linspace(0, 1, width, dtype=np.float32)[None].repeat(height, axis=0)
-    for place, title, low, high, colors in (
-        (0, "RMS difference of colour", 0.0, ERROR_SCALE, error_colors),
-        (
-            1,
-            "Difference of alpha (below 0: more background)",
-            -ALPHA_SCALE,
-            ALPHA_SCALE,
-            alpha_colors,
-        ),
-    ):
+    below = "Difference of alpha (below 0: more background)"
+    ramps = (
+        ("RMS difference of colour", 0.0, ERROR_SCALE, error_colors),
+        (below, -ALPHA_SCALE, ALPHA_SCALE, alpha_colors),
+    )
+    for place, (title, low, high, colors) in enumerate(ramps):
         start = left + place * (width + _APART)
         sheet.paste(Image.fromarray(colors(low + (high - low) * steps)), (start, top + 20))
         draw.text((start, top - 4), title, _INK, font)

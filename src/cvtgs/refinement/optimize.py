@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cvtgs.analysis import ambient_visibility
 from cvtgs.config import Rates, RefineConfig
-from cvtgs.counts import real_number, whole_number
+from cvtgs.counts import check_whole, real_number
 from cvtgs.cvt import nearest_site
 from cvtgs.cvt.nearest import runs_of_equal
 from cvtgs.errors import InvalidArgumentError
@@ -46,11 +46,8 @@ class Limits:
             raise InvalidArgumentError(
                 f"the refinement time in seconds must be above 0 and finite, found {seconds!r}."
             )
-        if steps is not None and whole_number(steps) < 1:
-            raise InvalidArgumentError(
-                f"the number of refinement steps must be a whole number of at least 1, found "
-                f"{steps!r}."
-            )
+        if steps is not None:
+            check_whole(steps, "the number of refinement steps")
         self._start = time.perf_counter()
         self._last = self._start
         self._seconds = None if seconds is None else float(seconds)  # also one of numpy

@@ -8,10 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.counts import whole_number
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.counts import check_whole
 from cvtgs.scene import SceneLike
-from cvtgs.text import shown
 from cvtgs.views.automatic import automatic_views
 from cvtgs.views.positions import CameraPositions, as_positions, checked_seed
 from cvtgs.views.scoring import SMOOTH, splat_sizes
@@ -69,10 +67,7 @@ def random_views(
         3
     """
     seed = checked_seed(seed, size=size)
-    if whole_number(count) < 0:
-        raise InvalidArgumentError(
-            f"count must be a whole number, at least 0; found {shown(count)}."
-        )
+    check_whole(count, "count", least=0)
     positions = as_positions(scene)
     layout = positions.layout
     eyes = positions.near(count, reach, seed)
