@@ -253,7 +253,7 @@ def _adopt(job: Job, files: Iterable[SortedFile]) -> None:
         found = f"{path.stat().st_size} bytes" if path.exists() else "no file"
         if found != f"{file.size} bytes":
             raise RunError(
-                f"{path}: must have the {file.size} bytes that a worker wrote, found {found}; "
+                f"{path}: must have the {file.size} bytes that were written, found {found}; "
                 "every worker must see the output folder under the same path; check the disk, too."
             )
         replace_file(path, job.path(file.name))
