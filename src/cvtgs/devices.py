@@ -28,8 +28,7 @@ CHUNK_BYTES = 1 << 29
 
 HOST = torch.device("cpu")
 
-ALIGNMENT = 128
-"""Bytes at which a tensor of a shared copy starts, enough for matrix products."""
+ALIGNMENT = 128  # bytes at which a tensor of a shared copy starts, enough for matrix products
 
 MOST_THREADS = 4
 """Maximum number of threads that share chunks of torch operations.

@@ -18,14 +18,9 @@ from cvtgs.filters import filter_rows
 from cvtgs.math.frames import RobustFrame, morton_order
 from cvtgs.scene import GaussianScene
 
-MEMBERS_PER_CELL = 4
-"""If cells would have fewer Gaussians on average, the tessellation is skipped."""
-
-REASSIGN = 7
-"""Number of neighbouring cells that a Gaussian may move to."""
-
-COLOR_CELLS = 10_000
-"""The number of cells at which ``cvt.color`` applies unchanged."""
+MEMBERS_PER_CELL = 4  # if cells would have fewer Gaussians on average, the tessellation is skipped
+REASSIGN = 7  # number of neighbouring cells that a Gaussian may move to
+COLOR_CELLS = 10_000  # the number of cells at which ``cvt.color`` applies unchanged
 
 FULL_RELIEF = 0.1
 """Ratio of cells to Gaussians from which on ``allocation.far_relief`` applies unchanged."""

@@ -31,8 +31,7 @@ __all__ = ["Merged", "Reduced", "merge_and_inflate", "reduce_scene"]
 NEIGHBORS = 8
 """Number of neighbouring cells that may cover the ends of a cell, and that the network sees."""
 
-CHUNK = 1 << 18
-"""Gaussians per chunk of distances, to bound memory."""
+CHUNK = 1 << 18  # Gaussians per chunk of distances, to bound memory
 
 
 class Merged(NamedTuple):

@@ -12,8 +12,7 @@ _UNSAFE = re.compile(
 )
 """Control characters except tab and line feed, direction marks, and lone surrogates."""
 
-MOST_LETTERS = 60
-"""Maximum length of a value in an error message."""
+MOST_LETTERS = 60  # maximum length of a value in an error message
 
 
 def shortened(text: str, length: int) -> str:

@@ -22,14 +22,9 @@ __all__ = [
 UNIT_TOLERANCE = 1e-5
 """Quaternions whose squared length differs from 1 by at most this count as unit quaternions."""
 
-MAX_MEAN = torch.finfo(torch.float32).max
-"""Files and renderers hold float32."""
-
-MAX_LOG_SCALE = math.log(MAX_MEAN)
-"""The logarithm of the largest float32 scale."""
-
-_FAR = 1e6
-"""Distance from the origin at which float32 has a resolution of a sixteenth of a unit."""
+MAX_MEAN = torch.finfo(torch.float32).max  # files and renderers hold float32
+MAX_LOG_SCALE = math.log(MAX_MEAN)  # the logarithm of the largest float32 scale
+_FAR = 1e6  # distance from the origin at which float32 has a resolution of a sixteenth of a unit
 
 
 class CheckedScene(NamedTuple):

@@ -19,8 +19,7 @@ from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 from cvtgs.tags import ANTIALIASED, TWO_SCALES
 from cvtgs.views import mixed_views
 
-MIN_OPACITY = 1e-6
-"""Floor of opacities in divisions."""
+MIN_OPACITY = 1e-6  # floor of opacities in divisions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -17,8 +17,7 @@ from cvtgs.scene import GaussianScene
 BAND_LOSS = 1e-5
 """Bands of the spherical harmonics that together change no colour by more are dropped."""
 
-UNBOUNDED_SHARE = 0.05
-"""A scene with more than this share of its mass far away is unbounded."""
+UNBOUNDED_SHARE = 0.05  # a scene with more than this share of its mass far away is unbounded
 
 FULLY_UNBOUNDED_SHARE = 0.1
 """From this share on, contraction has full strength; in between it sets in gradually."""
@@ -26,19 +25,16 @@ FULLY_UNBOUNDED_SHARE = 0.1
 DUPLICATE_SHARE = 0.01
 """With more than this share of duplicates, it pays to search only once per position."""
 
-UNBOUNDED_DISTANCE = 3.0
-"""Distance beyond which Gaussians count as far away, in robust radii."""
+UNBOUNDED_DISTANCE = 3.0  # distance beyond which Gaussians count as far away, in robust radii
 
 SAMPLE = 1 << 14
 """Approximate size of the sample, evenly spaced in the rows, that is examined first."""
 
-HASHED = 1 << 12
-"""Smallest expected size of the sample in which duplicates are counted."""
+HASHED = 1 << 12  # smallest expected size of the sample in which duplicates are counted
 
 CHUNK = 1 << 14
 
-LEAST_CONTRAST = 1e-6
-"""Floor of the contrast, for scenes of a single colour."""
+LEAST_CONTRAST = 1e-6  # floor of the contrast, for scenes of a single colour
 
 
 class Effect(Record):

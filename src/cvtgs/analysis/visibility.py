@@ -9,21 +9,15 @@ from torch import Tensor
 from cvtgs.devices import in_chunks, in_threads, row_chunks
 from cvtgs.math.frames import RobustFrame
 
-VOXEL = 0.04
-"""Side of a voxel, in robust radii of contracted space."""
-
-HALF_GRID = 64
-"""Voxels from the middle of the grid to its border."""
-
-REACH = 6
-"""Number of voxels in each direction whose optical depth counts."""
+VOXEL = 0.04  # side of a voxel, in robust radii of contracted space
+HALF_GRID = 64  # voxels from the middle of the grid to its border
+REACH = 6  # number of voxels in each direction whose optical depth counts
 
 MAX_DEPTH = 1e6
 FIXED_POINT = 2**20
 
 SLAB = 32
-CHUNK = 1 << 16
-"""Gaussians per chunk, to bound memory."""
+CHUNK = 1 << 16  # Gaussians per chunk, to bound memory
 
 
 def ambient_visibility(

@@ -17,8 +17,7 @@ from cvtgs.config import AllocationConfig
 from cvtgs.devices import in_chunks
 from cvtgs.math.segments import label_argmin, take_columns
 
-CHUNK = 1 << 15
-"""Gaussians per chunk of the cost computation, to bound memory."""
+CHUNK = 1 << 15  # Gaussians per chunk of the cost computation, to bound memory
 
 SHARE_PER_ROUND = 0.35
 """Largest number of pairs merged before costs are recomputed, as a share of the cells."""
@@ -36,17 +35,13 @@ COMMON_CONTRAST = 0.2
 LEAST_CONTRAST, LARGEST_CONTRAST = 0.3, 1.4
 """Limits of the contrast in weights, in units of the common one."""
 
-VIEWERS = 3.0
-"""Distance from the middle of the scene, in robust radii, from which it is often seen."""
+VIEWERS = 3.0  # distance from the middle of the scene, in robust radii, from which it is often seen
 
 SAMPLE = 1 << 16
 """Number of groups from which on only some of them are used to measure the contrast."""
 
-MOST_ROUNDS = 30
-"""Number of vectorised rounds that choose disjoint pairs; captures need 6 to 11."""
-
-ROW_BITS, LAST_ROW = 32, (1 << 32) - 1
-"""Keys to sort by have a row number in their lower bits."""
+MOST_ROUNDS = 30  # number of vectorised rounds that choose disjoint pairs; captures need 6 to 11
+ROW_BITS, LAST_ROW = 32, (1 << 32) - 1  # keys to sort by have a row number in their lower bits
 
 
 def merge_pairs(

@@ -10,17 +10,10 @@ from torch import Tensor
 
 from cvtgs.cells.partition import Partition
 
-MEMBER_FEATURES = 19
-"""Number of features of a member relative to its cell."""
-
-PAIR_FEATURES = 18
-"""Number of features of a neighbour relative to a cell."""
-
-CELL_FEATURES = 21
-"""Number of features of a cell itself."""
-
-PIXEL_SCALE = 0.3
-"""Factor of the logarithm of a size in pixels, the last feature of a cell."""
+MEMBER_FEATURES = 19  # number of features of a member relative to its cell
+PAIR_FEATURES = 18  # number of features of a neighbour relative to a cell
+CELL_FEATURES = 21  # number of features of a cell itself
+PIXEL_SCALE = 0.3  # factor of the logarithm of a size in pixels, the last feature of a cell
 
 LEAST_PIXELS = -6.0
 """Logarithm of the size in pixels of the smallest cells that training scenes have."""

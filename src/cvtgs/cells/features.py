@@ -19,8 +19,7 @@ from cvtgs.math.segments import gather_columns, segment_ids, segment_max, segmen
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
-LARGEST_DISTANCE = 50.0
-"""Distances in features are clamped to this, in standard deviations."""
+LARGEST_DISTANCE = 50.0  # distances in features are clamped to this, in standard deviations
 
 LARGEST_POSITION, LARGEST_LOG = 1e4, 80.0
 """Limits of positions and log scales, so that no product of them overflows float32."""

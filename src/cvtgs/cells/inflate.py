@@ -19,14 +19,12 @@ EQUAL_SHARE = 1e-2
 NEIGHBOR_PULL = 1e-4
 """Neighbours pull at undetermined axes as if eigenvalues differed by this share."""
 
-PROBE_SIGMAS = 3.0
-"""Both ends of an axis are probed this many standard deviations from the centre."""
+PROBE_SIGMAS = 3.0  # both ends of an axis are probed this many standard deviations from the centre
 
 FULL_COVER = 0.1
 """An end of an axis counts as fully covered where neighbours have at least this opacity."""
 
-CHUNK = 1 << 11
-"""Cells per chunk of probing; each takes about ``1 kB`` per neighbour."""
+CHUNK = 1 << 11  # cells per chunk of probing; each takes about ``1 kB`` per neighbour
 
 
 def align_axes(

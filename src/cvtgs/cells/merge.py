@@ -31,8 +31,7 @@ CHUNK_MEMBERS = 1 << 15
 OPAQUE = -math.log(0.01)
 """Optical depth of an opacity of 0.99, the largest that rasterizers paint at a pixel."""
 
-DOMINANT = 0.99
-"""A member with more than this share of the mass of its cell represents it."""
+DOMINANT = 0.99  # a member with more than this share of the mass of its cell represents it
 
 
 @checked

@@ -13,8 +13,7 @@ from cvtgs.math.segments import label_sums, take_columns
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
-CHUNK = 1 << 14
-"""Gaussians per chunk, of which a few columns fit into a cache."""
+CHUNK = 1 << 14  # Gaussians per chunk, of which a few columns fit into a cache
 
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Row and column of the six distinct entries of a symmetric matrix."""
@@ -22,11 +21,8 @@ UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 LARGEST_COLOR = 1.5
 """Limit of a colour, and of the norm of coefficients, so that a few extreme ones do not decide."""
 
-MAX_COMPONENTS = 12
-"""Largest number of components."""
-
-LEAST_SPREAD = 0.01
-"""Smallest standard deviation of a component that counts, in units of RGB."""
+MAX_COMPONENTS = 12  # largest number of components
+LEAST_SPREAD = 0.01  # smallest standard deviation of a component that counts, in units of RGB
 
 LEAST_SHARE = 0.1
 """Smallest share of the variance of a component that neighbours have in common; less is chance."""
@@ -34,11 +30,8 @@ LEAST_SHARE = 0.1
 MOST_MEDIANS = 1e6
 """Largest unit of masses, in medians: a few giants must not make all others 0 in float32."""
 
-LARGEST_MASS = 1e30
-"""Limit of masses, in this unit, so that sums are finite in float32."""
-
-SAMPLED_PAIRS = 1 << 14
-"""Approximate number of pairs of neighbours in which components are sought."""
+LARGEST_MASS = 1e30  # limit of masses, in this unit, so that sums are finite in float32
+SAMPLED_PAIRS = 1 << 14  # approximate number of pairs of neighbours in which components are sought
 
 
 class Moments(NamedTuple):

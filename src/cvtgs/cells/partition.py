@@ -24,8 +24,7 @@ from cvtgs.math.segments import (
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
 
-MOST_SAMPLED = 32
-"""Largest number of described members of a cell."""
+MOST_SAMPLED = 32  # largest number of described members of a cell
 
 LEAST_RATE = 1e-9
 """Limit of rates, so that weights stay finite where rounding samples a member of no mass."""

@@ -9,8 +9,7 @@ import pydantic
 from cvtgs.errors import ConfigError
 from cvtgs.text import shortened, shown
 
-MOST_PROBLEMS = 4
-"""Maximum number of problems that one error message names."""
+MOST_PROBLEMS = 4  # maximum number of problems that one error message names
 
 
 class Record(pydantic.BaseModel):

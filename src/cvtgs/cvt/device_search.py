@@ -17,27 +17,20 @@ from torch import Tensor
 from cvtgs.cvt.leaves import FAN_BITS, Boxes, Leaves, boxes_of, home_leaves, split_sites
 from cvtgs.devices import chunk_length, row_chunks
 
-LEAF = 16
-"""Largest number of sites in a leaf, unless more are wanted for each point."""
+LEAF = 16  # largest number of sites in a leaf, unless more are wanted for each point
 
 TILE = 32
 """Points per tile. Larger tiles make longer matrices, but compare each point with more sites."""
 
-TILES = 1 << 12
-"""Tiles per chunk of the descent, at the chunk length of a CPU."""
-
-DISTANCES = 1 << 22
-"""Distances per matrix product, at the chunk length of a CPU."""
+TILES = 1 << 12  # tiles per chunk of the descent, at the chunk length of a CPU
+DISTANCES = 1 << 22  # distances per matrix product, at the chunk length of a CPU
 
 CLOSE = 1e-5
 """Squared distances below this share of the squared reach of a tile are too close for float32,
 which is off by at most some 3e-7 of it; they are computed again in float64."""
 
-EXACT_COST = 8
-"""Memory of an exact distance, in units of that of a fast one, rounded up."""
-
-SLACK = 1 + 1e-5
-"""Bounds grow by this factor, against rounding of gaps between boxes."""
+EXACT_COST = 8  # memory of an exact distance, in units of that of a fast one, rounded up
+SLACK = 1 + 1e-5  # bounds grow by this factor, against rounding of gaps between boxes
 
 LEAST_GAP, LARGEST_GAP = 1e-18, 1e17
 """Limits of gaps in float32, in units of a common search radius."""

@@ -9,14 +9,12 @@ from cvtgs.devices import in_chunks
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import SH_C0
 
-CHUNK = 1 << 16
-"""Gaussians per chunk of the embedding, to bound memory."""
+CHUNK = 1 << 16  # Gaussians per chunk of the embedding, to bound memory
 
 FARTHEST = 1e30
 """Coordinates are clamped to this, in robust radii, so that flyaways cannot overflow float32."""
 
-COLOR_HEADROOM = 0.5
-"""Colours are clamped at 1 plus this."""
+COLOR_HEADROOM = 0.5  # colours are clamped at 1 plus this
 
 
 @checked

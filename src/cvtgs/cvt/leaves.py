@@ -7,11 +7,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-FAN_BITS = 3
-"""Levels of the tree that are descended at once: a box has eight children."""
-
-FARTHEST = 1e37
-"""Limit of coordinates in float32, in units."""
+FAN_BITS = 3  # levels of the tree that are descended at once: a box has eight children
+FARTHEST = 1e37  # limit of coordinates in float32, in units
 
 
 class Boxes(NamedTuple):

@@ -22,8 +22,7 @@ from cvtgs.math.segments import ascending_rows
 NearestSite = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Maps points ``(n, d)`` and sites ``(m, d)`` to labels and squared distances ``(n,)``."""
 
-CHUNK = 1 << 15
-"""Points per chunk of a search thread, to bound memory."""
+CHUNK = 1 << 15  # points per chunk of a search thread, to bound memory
 
 TINY_SHIFT = 1e-9
 """Coincident sites are separated by at most this share of the robust radius of all sites."""

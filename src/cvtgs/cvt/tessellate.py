@@ -17,8 +17,7 @@ from cvtgs.devices import move_together
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.segments import label_argmin, label_sums, smallest_rows
 
-MIN_SAMPLES = 1 << 15
-"""Smallest sample of points for Lloyd; fewer would save next to no time."""
+MIN_SAMPLES = 1 << 15  # smallest sample of points for Lloyd; fewer would save next to no time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -22,8 +22,7 @@ from cvtgs.errors import (
 )
 from cvtgs.io.files import is_file, is_folder, read_json
 
-MAX_PIXELS = 1 << 20
-"""Largest width and height of images; a larger number is considered damaged."""
+MAX_PIXELS = 1 << 20  # largest width and height of images; a larger number is considered damaged
 
 _SKEW = 0.01
 _TEST_EVERY = 8

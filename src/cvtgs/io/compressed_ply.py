@@ -35,8 +35,7 @@ __all__ = ["read_compressed_ply", "write_compressed_ply"]
 
 Rows = NDArray[Any]
 
-_CHUNK_ROWS = 256
-"""Gaussians in a chunk, which share its ranges."""
+_CHUNK_ROWS = 256  # Gaussians in a chunk, which share its ranges
 
 _FLYAWAY_RADII = 30.0
 """Distance of a flyaway from the middle, in radii that contain 90 % of the scene."""
@@ -54,11 +53,8 @@ _UNCOLORED = 12
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 """Properties of a vertex, 32 bits each."""
 
-_THREE_BITS = (11, 10, 11)
-"""Bits of positions and scales."""
-
-_COLOR_BITS = (8, 8, 8, 8)
-"""Bits of red, green, blue and opacity."""
+_THREE_BITS = (11, 10, 11)  # bits of positions and scales
+_COLOR_BITS = (8, 8, 8, 8)  # bits of red, green, blue and opacity
 
 _QUAT_BITS = (10, 10, 10)
 """Bits of the three smaller components of a rotation; the top two bits index the missing one."""

@@ -30,8 +30,7 @@ _KNOWN = (
 )
 
 
-FEWEST_JUDGED = 100
-"""Values of fewer Gaussians are never reported as unlikely."""
+FEWEST_JUDGED = 100  # values of fewer Gaussians are never reported as unlikely
 
 SMALL_SCALE = 0.5
 """Scales look activated if all are above 0 and their median is below this. As logarithms, they

@@ -27,12 +27,9 @@ FREE_BYTES = 1 << 26
 """A scene of at most this many bytes in memory may come from a file of any size."""
 MOST_EXPANSION = 64
 """Beyond that, a scene may take this many times the bytes of its file; real ones take 4 to 13."""
-LONGEST_NAME = 255
-"""Characters that file systems allow in a name."""
-_FLOATS = 11
-"""Numbers of a Gaussian without SH coefficients."""
-_MOST_WHOLE = 1 << 53
-"""Whole numbers up to here are the same in every JSON parser."""
+LONGEST_NAME = 255  # characters that file systems allow in a name
+_FLOATS = 11  # numbers of a Gaussian without SH coefficients
+_MOST_WHOLE = 1 << 53  # whole numbers up to here are the same in every JSON parser
 
 
 @contextmanager

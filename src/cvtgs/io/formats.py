@@ -53,11 +53,8 @@ _ADVICE = (
 _SIZED = (".compressed.ply", ".splat", ".ksplat")
 """Formats besides plain PLY that store every row, so that ``trust_sizes`` does not apply."""
 
-_STREAM = "lod-meta.json"
-"""File name of a streamed SOG, the only format with several levels."""
-
-_STATES_AXES = (".spz", ".glb", ".gltf")
-"""Formats whose readers convert axes themselves."""
+_STREAM = "lod-meta.json"  # file name of a streamed SOG, the only format with several levels
+_STATES_AXES = (".spz", ".glb", ".gltf")  # formats whose readers convert axes themselves
 
 _FILE_AXES = {".spz.glb": "luf", ".glb": "luf", ".gltf": "luf", ".usda": "rub"}
 """Axes that a format prescribes, by suffix."""

@@ -11,8 +11,7 @@ from cvtgs.tags import ANTIALIASED, TWO_SCALES
 from cvtgs.text import counted
 from cvtgs.validity import writable_rows
 
-SCALE_RANGE = (-87.3, 88.7)
-"""Logarithms of the scales that float32 holds with full precision."""
+SCALE_RANGE = (-87.3, 88.7)  # logarithms of the scales that float32 holds with full precision
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -46,13 +46,11 @@ _SECTION = struct.Struct("<IIIIfHxxIIIIH")
 _NUMBERS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 """Types of positions, of scales and rotations, and of SH, by compression level."""
 
-_RANGE = 32767
-"""Quantised positions are centred on this number, unless the section states another."""
+_RANGE = 32767  # quantised positions are centred on this number, unless the section states another
 
 _SH_RANGE = (-1.5, 1.5)
 
-_COMPONENTS = (0, 9, 24)
-"""View-dependent SH components of a Gaussian, by degree."""
+_COMPONENTS = (0, 9, 24)  # view-dependent SH components of a Gaussian, by degree
 
 
 def read_splat(path: Path) -> GaussianScene:

@@ -14,11 +14,8 @@ from typing import BinaryIO, Protocol, cast
 
 from cvtgs.errors import RENAMINGS, CvtgsError, FileFormatError, InputError, OutputError, reason_of
 
-MEMORY_BYTES = 1 << 26
-"""A file is built in memory up to this size, and on disk beyond it."""
-
-CHUNK_BYTES = 1 << 16
-"""Bytes of a stream that are read at once."""
+MEMORY_BYTES = 1 << 26  # a file is built in memory up to this size, and on disk beyond it
+CHUNK_BYTES = 1 << 16  # bytes of a stream that are read at once
 
 _FIRST_BYTES = {b"ply": ".ply", b"\x1f\x8b": ".spz", b"NGSP": ".spz", b"glTF": ".glb"}
 _TORCH_MEMBER = re.compile(r"[^/]+/data\.pkl")

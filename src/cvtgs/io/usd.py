@@ -14,8 +14,7 @@ from cvtgs.scene import GaussianScene
 from cvtgs.text import printable
 
 _CHUNK_ROWS = 1 << 15
-_SIGMAS = 3.0
-"""Extent of a Gaussian in the bounds, in standard deviations."""
+_SIGMAS = 3.0  # extent of a Gaussian in the bounds, in standard deviations
 
 
 def write_usda(scene: GaussianScene, file: BinaryIO) -> None:

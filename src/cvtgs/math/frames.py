@@ -9,14 +9,9 @@ from torch import Tensor
 
 from cvtgs.devices import in_chunks, in_threads
 
-RADIUS_QUANTILE = 0.7
-"""The share of points within the radius of a frame."""
-
-CHUNK = 1 << 16
-"""Points per chunk, to bound memory."""
-
-BITS = 21
-"""Bits per axis; three axes fill a 63-bit code."""
+RADIUS_QUANTILE = 0.7  # the share of points within the radius of a frame
+CHUNK = 1 << 16  # points per chunk, to bound memory
+BITS = 21  # bits per axis; three axes fill a 63-bit code
 
 _SPREAD = (
     (32, 0x1F00000000FFFF),

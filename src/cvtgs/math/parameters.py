@@ -11,17 +11,13 @@ from torch import Tensor
 
 from cvtgs.math.eigen import symmetric_eigen
 
-OPACITY_MARGIN = 1e-6
-"""Opacities stay this far from 0 and from 1."""
+OPACITY_MARGIN = 1e-6  # opacities stay this far from 0 and from 1
 
 LOGIT_LIMIT = math.log((1.0 - OPACITY_MARGIN) / OPACITY_MARGIN)
 """The logit of the largest opacity, about 13.8."""
 
-MIN_ALPHA = 1 / 255
-"""Gaussians of lower alpha in a pixel are not drawn there."""
-
-EIGENVALUE_FLOOR = 1e-12
-"""Floor of eigenvalues as a share of the largest one (for scales: 1e-6)."""
+MIN_ALPHA = 1 / 255  # Gaussians of lower alpha in a pixel are not drawn there
+EIGENVALUE_FLOOR = 1e-12  # floor of eigenvalues as a share of the largest one (for scales: 1e-6)
 
 AREA_EXPONENT = 1.6075
 """Thomsen's exponent, with which the ellipsoid surface formula is within 1.1 % for all shapes."""

@@ -12,8 +12,7 @@ from cvtgs.errors import InvalidArgumentError
 SH_C0 = 0.5 / math.sqrt(math.pi)
 """The constant band: the colour of degree 0 is ``0.5 + SH_C0 * sh0``."""
 
-SH_C1 = math.sqrt(3 / (4 * math.pi))
-"""The factor of the three linear functions."""
+SH_C1 = math.sqrt(3 / (4 * math.pi))  # the factor of the three linear functions
 
 SH_C2 = (math.sqrt(15 / (4 * math.pi)), math.sqrt(5 / (16 * math.pi)))
 """The factors of the quadratic functions: of ``xy``, ``yz``, ``xz`` (half of it of
@@ -28,11 +27,8 @@ SH_C3 = (
 """The factors of the cubic functions, by rising rotational symmetry: of ``y (3xx - yy)``, ``xyz``
 (half of it of ``z (xx - yy)``), ``y (4zz - xx - yy)`` and ``z (2zz - 3xx - 3yy)``."""
 
-REST_COUNTS = (0, 3, 8, 15)
-"""Coefficients per colour channel above the constant band, by degree."""
-
-_ROUNDING = 1e-12
-"""Entries of a rotation of SH bands below this are set to zero."""
+REST_COUNTS = (0, 3, 8, 15)  # coefficients per colour channel above the constant band, by degree
+_ROUNDING = 1e-12  # entries of a rotation of SH bands below this are set to zero
 
 
 def degree_of(rest_count: int) -> int:

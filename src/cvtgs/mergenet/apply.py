@@ -16,8 +16,7 @@ from cvtgs.mergenet.model import MergeNet, Residuals
 from cvtgs.mergenet.published import Net, PublishedMergeNet, PublishedResiduals, describe_published
 from cvtgs.scene import GaussianScene
 
-CHUNK_MEMBERS = 1 << 15
-"""Members and neighbours per chunk; each takes about ``2 kB``."""
+CHUNK_MEMBERS = 1 << 15  # members and neighbours per chunk; each takes about ``2 kB``
 
 _LARGEST = 1e15
 

@@ -29,14 +29,9 @@ SHIPPED = ("standard", "paper")
 """Names of the checkpoints that come with the package."""
 
 FORMAT = "cvtgs-mergenet"
-FORMAT_VERSION = 2
-"""Files of version 1 have no known range, so their networks correct every cell."""
-
-KNOWN = "known."
-"""Prefix of the names of the tensors of the known range."""
-
-LARGEST_FILE = 1 << 26
-"""Files above 64 MiB are not read; a MergeNet has less than 1 MiB."""
+FORMAT_VERSION = 2  # files of version 1 have no known range, so their networks correct every cell
+KNOWN = "known."  # prefix of the names of the tensors of the known range
+LARGEST_FILE = 1 << 26  # files above 64 MiB are not read; a MergeNet has less than 1 MiB
 
 
 class LearnedScene(Record):

@@ -23,14 +23,9 @@ from cvtgs.config.base import Record
 from cvtgs.devices import move_together
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
 
-LARGE_GROWTH = 0.6
-"""Unit of changes of log scales in the cost of residuals."""
-
-LARGEST_LOGIT_CHANGE = 2.0
-"""Largest change of an opacity logit."""
-
-LARGEST_TURN = 0.5
-"""Largest rotation of a cell about each of its axes, in radians."""
+LARGE_GROWTH = 0.6  # unit of changes of log scales in the cost of residuals
+LARGEST_LOGIT_CHANGE = 2.0  # largest change of an opacity logit
+LARGEST_TURN = 0.5  # largest rotation of a cell about each of its axes, in radians
 
 LARGEST_MEMBER_GATE = 2.0
 LARGEST_PAIR_GATE = 0.5
@@ -38,14 +33,9 @@ LARGEST_PAIR_GATE = 0.5
 SUMMARY_FEATURES = CELL_FEATURES - 1 + MEMBER_FEATURES + PAIR_FEATURES
 """Number of features that decide whether a cell is similar to the training cells."""
 
-TAIL = 0.01
-"""Share of the cells of a case that is ignored at both ends of each feature."""
-
-MARGIN = 0.1
-"""Corrections fade to zero beyond the range over this share of its width."""
-
-NARROWEST = 0.01
-"""Smallest width of this fade, for features that did not vary in training."""
+TAIL = 0.01  # share of the cells of a case that is ignored at both ends of each feature
+MARGIN = 0.1  # corrections fade to zero beyond the range over this share of its width
+NARROWEST = 0.01  # smallest width of this fade, for features that did not vary in training
 
 MEMBERS, MOST_MEMBERS = 9, 2000
 """Index of the feature ``0.2 log(members)``, and the largest number of members that is corrected.
@@ -54,8 +44,7 @@ Larger cells occur in the middle of unbounded scenes where most cells are spent 
 cover the cameras when they grow, so the limit holds whatever the training cases contain.
 """
 
-WIDEST = 1e30
-"""Absolute value of both ends of the range before it is fitted."""
+WIDEST = 1e30  # absolute value of both ends of the range before it is fitted
 
 
 class Architecture(Record):

@@ -20,8 +20,7 @@ from cvtgs.scene import GaussianScene
 BackendName = Literal["auto", "torch", "numba", "gsplat"]
 """The names that :func:`choose_backend` accepts."""
 
-STAGE = "render"
-"""Stage name in progress events; one step per camera."""
+STAGE = "render"  # stage name in progress events; one step per camera
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -29,11 +29,8 @@ except (ImportError, OSError) as error:
         f"{how_to_install('numba')}, or use backend='torch'."
     ) from error
 
-Array = NDArray[Any]
-"""Floats, all of one dtype, which numba infers."""
-
-Ints = NDArray[Any]
-"""Integers."""
+Array = NDArray[Any]  # Floats, all of one dtype, which numba infers
+Ints = NDArray[Any]  # integers
 
 PixelBox = tuple[int, int, int, int]
 """Half-open pixel ranges: first column, end column, first row, end row."""

@@ -14,11 +14,8 @@ from cvtgs.rendering.compiled import Array, Ints, PixelBox, TileArrays, parallel
 from cvtgs.rendering.kernels_tiles import LOG_MIN_ALPHA, box_of, span, tile_at
 from cvtgs.rendering.projection import MAX_ALPHA, MIN_TRANSMITTANCE
 
-WIDEST = 1e9
-"""Half widths of splats beyond this, in pixels, count as this."""
-
-BATCH = 64
-"""Splats of a tile that are copied together; reads of scattered rows then overlap."""
+WIDEST = 1e9  # half widths of splats beyond this, in pixels, count as this
+BATCH = 64  # splats of a tile that are copied together; reads of scattered rows then overlap
 
 
 @serial

@@ -18,8 +18,7 @@ from cvtgs.rendering.compiled import (
 )
 from cvtgs.rendering.projection import NEAR_PLANE
 
-CHUNK = 256
-"""Gaussians per step of a parallel loop, which share their scratch arrays."""
+CHUNK = 256  # Gaussians per step of a parallel loop, which share their scratch arrays
 
 C2A, C2B = SH_C2
 C3A, C3B, C3C, C3D = SH_C3

@@ -28,8 +28,7 @@ from cvtgs.rendering.kernels_weights import TileWeights
 from cvtgs.rendering.projection import Pinhole, to_pinholes
 from cvtgs.scene import GaussianScene
 
-SIDE = 16
-"""Pixels along a tile's edge."""
+SIDE = 16  # pixels along a tile's edge
 
 
 def require(device: torch.device) -> None:

@@ -15,17 +15,13 @@ from cvtgs.scene import GaussianScene
 
 # Constants of the 3DGS rasterizer (Kerbl et al. 2023, section 6 and their renderer).
 
-NEAR_PLANE = 0.01
-"""Gaussians whose centre is at a smaller depth are not rendered; scene units."""
-
-DILATION = 0.3
-"""Variance added to every projected Gaussian, squared pixels."""
+NEAR_PLANE = 0.01  # Gaussians whose centre is at a smaller depth are not rendered; scene units
+DILATION = 0.3  # variance added to every projected Gaussian, squared pixels
 
 FRUSTUM_MARGIN = 0.3
 """Slopes in the Jacobian are clamped to the image plus this share of half its size."""
 
-MAX_ALPHA = 0.99
-"""Largest alpha of one Gaussian in a pixel."""
+MAX_ALPHA = 0.99  # largest alpha of one Gaussian in a pixel
 
 MIN_TRANSMITTANCE = 1e-4
 """A pixel is finished before the Gaussian that would lower its transmittance below this."""

@@ -29,8 +29,7 @@ from cvtgs.rendering.projection import (
 )
 from cvtgs.scene import GaussianScene
 
-TILE = {"cpu": 8}
-"""Pixels along a tile's edge, by device type; small tiles waste fewer operations."""
+TILE = {"cpu": 8}  # pixels along a tile's edge, by device type; small tiles waste fewer operations
 
 _TILE_ELSEWHERE = 16
 
@@ -39,11 +38,8 @@ CELLS = {"cpu": 1 << 18}
 
 _CELLS_ELSEWHERE = 1 << 23
 
-_DEPTH = 32
-"""Splats of each tile in one batch."""
-
-_SLACK = 1e-3
-"""Pixels by which boxes are enlarged, so that rounding omits nothing."""
+_DEPTH = 32  # splats of each tile in one batch
+_SLACK = 1e-3  # pixels by which boxes are enlarged, so that rounding omits nothing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

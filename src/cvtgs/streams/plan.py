@@ -29,14 +29,12 @@ CHUNK_GAUSSIANS = 1 << 15
 ENVIRONMENT_GAUSSIANS = 1 << 16
 """Maximum size of the environment, unless the coarsest level has more that far away."""
 
-_SIGMAS = 3.0
-"""Extent of Gaussians in the boxes of chunks, in standard deviations."""
+_SIGMAS = 3.0  # extent of Gaussians in the boxes of chunks, in standard deviations
 
 _SPREAD = (0.05, 0.95)
 """Quantiles whose distance selects the axis of a split; they exclude outlying Gaussians."""
 
-_SAMPLE = 1 << 16
-"""Points used for these quantiles."""
+_SAMPLE = 1 << 16  # points used for these quantiles
 
 
 class StreamedLevel(Protocol):

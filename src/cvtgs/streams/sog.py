@@ -24,8 +24,7 @@ from cvtgs.streams.plan import StreamNode, StreamPlan, environment_level
 
 __all__ = ["write_sog_stream"]
 
-FILE_GAUSSIANS = 1 << 18
-"""Maximum number of Gaussians in a file, unless a single chunk has more."""
+FILE_GAUSSIANS = 1 << 18  # maximum number of Gaussians in a file, unless a single chunk has more
 
 
 _FAR = "environment"

@@ -85,8 +85,7 @@ class Chunk:
         return torch.sigmoid(torch.where(opaque, 4.5 + self.normals(), others))
 
 
-Draw = Callable[[Chunk], GaussianScene]
-"""Function that makes the Gaussians of one chunk of a part."""
+Draw = Callable[[Chunk], GaussianScene]  # function that makes the Gaussians of one chunk of a part
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

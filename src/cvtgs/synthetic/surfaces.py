@@ -41,8 +41,7 @@ _FACES = (
 Surface = Callable[[Float[Tensor, "n 2"]], SurfacePoints]
 """Function from points of the unit square to points of the surface."""
 
-Heights = Callable[[Float[Tensor, "n 2"]], Float[Tensor, "n"]]
-"""Height of the ground at x, z."""
+Heights = Callable[[Float[Tensor, "n 2"]], Float[Tensor, "n"]]  # height of the ground at x, z
 
 
 def placed(

@@ -34,8 +34,7 @@ SPZ = "KHR_gaussian_splatting_compression_spz_2"
 QUANTIZATION = "KHR_mesh_quantization"
 KERNEL = "ellipse"
 COLOR_SPACE = "srgb_rec709_display"
-AXES = "luf"
-"""Axes of every glTF: y up, z forward, hence x left (section 3.4 of glTF 2.0)."""
+AXES = "luf"  # axes of every glTF: y up, z forward, hence x left (section 3.4 of glTF 2.0)
 
 POSITION, COLOR = "POSITION", "COLOR_0"
 ROTATION, SCALE, OPACITY = f"{SPLATS}:ROTATION", f"{SPLATS}:SCALE", f"{SPLATS}:OPACITY"

@@ -52,8 +52,7 @@ from cvtgs.text import counted, printable, shown
 
 _KNOWN = (SPLATS, SPZ, QUANTIZATION)
 _POINTS = 0
-_EVENNESS = 1e-4
-"""Tolerance for the scale of a node to count as uniform, relative to it."""
+_EVENNESS = 1e-4  # tolerance for the scale of a node to count as uniform, relative to it
 
 Matrix = Float[np.ndarray, "4 4"]
 

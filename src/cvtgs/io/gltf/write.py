@@ -42,8 +42,7 @@ from cvtgs.scene import GaussianScene
 
 _CHUNK_ROWS = 1 << 18
 _ARRAY_BUFFER = 34962
-_SPZ_VERSION: Final = 3
-"""The newest version that readers of the draft of the extension accept."""
+_SPZ_VERSION: Final = 3  # the newest version that readers of the draft of the extension accept
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,11 +16,8 @@ from cvtgs.text import shown
 
 Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
 
-Layout = tuple[tuple[str, str], ...]
-"""Property names and PLY types of an element, in order."""
-
-MAX_HEADER_BYTES = 1 << 20
-"""Longer headers are refused; a 3DGS header has about two thousand bytes."""
+Layout = tuple[tuple[str, str], ...]  # property names and PLY types of an element, in order
+MAX_HEADER_BYTES = 1 << 20  # longer headers are refused; a 3DGS header has about two thousand bytes
 
 _OTHER_FILES = {
     b"\x1f\x8b": "a gzip file; unpack it first, or rename it if it is an .spz",

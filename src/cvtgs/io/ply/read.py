@@ -37,8 +37,7 @@ from cvtgs.text import shown
 CHUNK_BYTES = 1 << 20
 """Bytes of a file that are mapped at a time; a chunk and its copy fit into the L2 cache."""
 
-_CHUNK_ROWS = 1 << 12
-"""Rows of plyfile that are copied at a time; they fit into a cache."""
+_CHUNK_ROWS = 1 << 12  # rows of plyfile that are copied at a time; they fit into a cache
 
 _NOT_ASCII = bytes.maketrans(bytes(range(128, 256)), b"?" * 128)
 

@@ -12,8 +12,7 @@ from cvtgs.io.ply.header import FLOAT_TYPES, SCALARS, Layout, header_bytes, row_
 from cvtgs.io.ply.properties import dtype_of, is_standard, standard_slots
 from cvtgs.scene import FLAT_LOG_SCALE, NORMALS, GaussianScene
 
-CHUNK_BYTES = 1 << 20
-"""Bytes that are gathered before they are written."""
+CHUNK_BYTES = 1 << 20  # bytes that are gathered before they are written
 
 _NATURAL_TYPES = {
     torch.bool: "uchar",

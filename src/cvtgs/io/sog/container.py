@@ -16,17 +16,13 @@ from cvtgs.io.files import LONGEST_NAME, is_file, is_within, open_input
 from cvtgs.text import shown
 
 META = "meta.json"
-MOST_META_BYTES = 1 << 20
-"""Largest size of ``meta.json``; real ones have about ten thousand bytes."""
+MOST_META_BYTES = 1 << 20  # largest size of ``meta.json``; real ones have about ten thousand bytes
 
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compression methods whose output zipfile bounds; it unpacks blocks of bzip2 or LZMA whole."""
 
-QUAT_TAG = 252
-"""The last byte of a rotation is this plus the number of its omitted component."""
-
-PALETTE_COLUMNS = 64
-"""Entries of the SH palette per row of its image."""
+QUAT_TAG = 252  # the last byte of a rotation is this plus the number of its omitted component
+PALETTE_COLUMNS = 64  # entries of the SH palette per row of its image
 
 Reader = Callable[[str, int], bytes]
 """Reads a file by its name; a file of more than the given number of bytes is an error."""

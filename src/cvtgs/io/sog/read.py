@@ -36,8 +36,7 @@ from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 from cvtgs.tags import TWO_SCALES
 
-_MOST_COUNT = 16383**2
-"""Pixels of the largest WebP image."""
+_MOST_COUNT = 16383**2  # pixels of the largest WebP image
 
 _LABELS = 1 << 16
 _SPARE_PIXELS = 1 << 16

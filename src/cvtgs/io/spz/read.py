@@ -18,14 +18,12 @@ MAGIC = 0x5053474E
 HEADER = struct.Struct("<IIIBBBB")
 ANTIALIASED_FLAG = 1
 EXTENSIONS_FLAG = 2
-AXES_EXTENSION = 0xADBE0003
-"""The type of Adobe's extension for the axes, which it numbers from 1."""
+AXES_EXTENSION = 0xADBE0003  # the type of Adobe's extension for the axes, which it numbers from 1
 
 FOURTH_HEADER_BYTES = 32
 """Header size of version 4; extensions follow, then the sizes of the blocks, then the blocks."""
 
-TABLE_ENTRY = struct.Struct("<QQ")
-"""Compressed and uncompressed size of a block, in bytes."""
+TABLE_ENTRY = struct.Struct("<QQ")  # compressed and uncompressed size of a block, in bytes
 
 COLOR_SCALE = np.float32(0.15)
 """Colour bytes store ``0.5 + 0.15 sh0``, a wider range than displayable colours."""
