@@ -70,17 +70,6 @@ class Box(pydantic.BaseModel):
         return self
 
 
-def checked_box(low: Sequence[float], high: Sequence[float], name: str) -> Box:
-    """Build a box from numbers that the user gave; errors mention the name of the option."""
-    try:
-        return Box.model_validate({"min": tuple(low), "max": tuple(high)})
-    except pydantic.ValidationError as error:
-        raise InvalidArgumentError(
-            f"{name} must be six finite numbers, the smallest x, y, z and then the "
-            f"largest, found {', '.join(f'{number:g}' for number in (*low, *high))}."
-        ) from error
-
-
 def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
     """Read boxes from a JSON file.
 

@@ -78,11 +78,14 @@ def test_edits_use_the_axes_of_a_ply(tmp_path: Path, scene: GaussianScene) -> No
             ["--crop-box", "1,2,3"],
             "--crop-box must be six numbers x,y,z,X,Y,Z, the minimum and max",
         ),
-        (["--crop-box", "1,0,0,0,1,1"], "--crop-box must be six finite numbers, the small"),
+        (
+            ["--crop-box", "1,0,0,0,1,1"],
+            "min nowhere above max, found min=",
+        ),
         (["--crop-sphere", "0,0,0,-1"], "a radius of at least 0"),
         (["--crop-sphere", "0,0,0,0"], "at least one Gaussian must be left to write, found n"),
-        (["--min-opacity", "2"], "--min-opacity must be from 0 to 1, found 2.0."),
-        (["--max-size", "0"], "--max-size must be above 0, found 0.0."),
+        (["--min-opacity", "2"], "the lowest opacity to keep must be from 0 to 1, found 2.0."),
+        (["--max-size", "0"], "the largest size to keep must be above 0, found 0.0."),
         (["--scale", "-1"], "--scale must be above 0 and finite, found -1.0."),
         (
             ["--scale", "1e-60"],

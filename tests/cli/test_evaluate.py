@@ -151,12 +151,11 @@ def test_invalid_arguments_are_refused_in_one_sentence(scenes, capsys, words, te
     assert errors.count("\n") == 1
 
 
-def test_a_size_of_two_numbers_is_refused_with_an_example(capsys):
+def test_a_size_of_two_numbers_is_refused(capsys):
     with pytest.raises(SystemExit):
         main(["render", "a.ply", "-o", "out", "--size", "400x300"])
     assert capsys.readouterr().err.endswith(
-        "argument --size: must be the longer side of the images in pixels, for example 400, "
-        "found '400x300'\n"
+        "argument --size: must be a whole number, found '400x300'\n"
     )
 
 

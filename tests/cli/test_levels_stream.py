@@ -48,7 +48,7 @@ def test_a_small_stream_is_one_chunk(words: list[str], capsys: pytest.CaptureFix
         (["--stream", "3dtiles", "--environment", "9"], "and needs --stream sog; found 9."),
         (["--stream", "sog", "--environment", "-1"], "--environment must be above 0"),
         (["--memory", "2GB"], "--memory needs --stream."),
-        (["--stream", "sog", "--place", "8,47"], "and it needs --stream 3dtiles."),
+        (["--stream", "sog", "--place", "8,47"], "--place and --transform need --stream 3dtiles."),
         (
             ["--stream", "3dtiles", "--place", "8"],
             "--place must be 2 or 3 numbers separated by commas",

@@ -104,10 +104,14 @@ def test_without_a_command_the_help_is_printed(capsys):
         *(
             (
                 [command, "a.ply", "-o", "d", "--rho", "0.1,x"],
-                "argument --rho: must be different numbers separated by commas, for example "
-                "0.1,0.01 or 10%,1%; found '0.1,x'\n",
+                "argument --rho: a ratio must be a number such as 0.05 or 5%, found 'x'\n",
             )
             for command in ("levels", "tradeoff")
+        ),
+        (
+            ["levels", "a.ply", "-o", "d", "--rho", "0.1,10%"],
+            "argument --rho: must be different numbers separated by commas, for example 0.1,0.01 "
+            "or 10%,1%; found '0.1,10%'\n",
         ),
         (
             ["levels", "a.ply", "-o", "d", "--rho", "0"],

@@ -19,14 +19,15 @@ def add_block_options(parser: argparse.ArgumentParser) -> None:
         help="memory to use, for example 4GB (default: the free memory); a binary .ply that needs "
         "more is processed in blocks, and the same command resumes an interrupted run",
     )
-    parser.add_argument(
+    places = parser.add_mutually_exclusive_group()
+    places.add_argument(
         "--workers",
         type=int,
         metavar="N",
         help="processes for the blocks, which share --memory (default: one per core, as far as "
         "memory allows)",
     )
-    parser.add_argument(
+    places.add_argument(
         "--scheduler",
         metavar="ADDRESS",
         help="address of a Dask cluster that processes the blocks; its workers need access to "
@@ -35,14 +36,11 @@ def add_block_options(parser: argparse.ArgumentParser) -> None:
 
 
 def memory_of(options: argparse.Namespace) -> int:
-    """Return the memory to use, in bytes; raise if the options of workers are invalid."""
+    """Return the memory to use, in bytes; raise if there would be no worker."""
     from cvtgs.outofcore.memory import available_memory, memory_to_plan, read_bytes
 
-    if options.workers is not None and (options.workers < 1 or options.scheduler is not None):
-        raise InvalidArgumentError(
-            "--workers must be at least 1, and cannot be used with --scheduler; found "
-            f"{options.workers}."
-        )
+    if options.workers is not None and options.workers < 1:
+        raise InvalidArgumentError(f"--workers must be at least 1, found {options.workers}.")
     if options.memory is None:
         return memory_to_plan(available_memory())
     return read_bytes(options.memory)

@@ -36,22 +36,12 @@ def add_view_options(parser: argparse.ArgumentParser, *, size: int, **helps: str
     add_options(parser, "--cameras", "--split", "--views", **helps)
     parser.add_argument(
         "--size",
-        type=longer_side,
+        type=int,
         metavar="N",
         help=f"longer side of the images in pixels (default {size}, or that of --cameras)",
     )
     add_options(parser, "--background", "--backend", "--device", "--quiet")
     parser.set_defaults(default_size=size)
-
-
-def longer_side(text: str) -> int:
-    """Read ``--size``, for argparse."""
-    try:
-        return int(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(
-            f"must be the longer side of the images in pixels, for example 400, found {text!r}"
-        ) from error
 
 
 def check_view_options(options: argparse.Namespace) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import cvtgs
 from cvtgs.cli.display import say
-from cvtgs.cli.options import AddParser
+from cvtgs.cli.options import AddParser, add_options
 from cvtgs.errors import CvtgsError, DeviceError
 
 if TYPE_CHECKING:
@@ -66,12 +66,7 @@ def add_doctor(add_parser: AddParser) -> None:
         "on a generated scene. The exit status is 0 if this run works, else 1.",
     )
     parser.set_defaults(run=doctor)
-    parser.add_argument(
-        "--device",
-        default="auto",
-        metavar="DEVICE",
-        help="device to check: auto (default: all), cpu or cuda",
-    )
+    add_options(parser, "--device", device="device to check: auto (default: all), cpu or cuda")
 
 
 def doctor(options: argparse.Namespace) -> None:

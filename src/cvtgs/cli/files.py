@@ -4,7 +4,7 @@ import argparse
 import math
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,14 +20,19 @@ from cvtgs.cli.jobs import (
     open_jobs,
     run_jobs,
 )
-from cvtgs.cli.options import AddParser, add_options, read_axes, read_scene, read_settings
+from cvtgs.cli.options import (
+    AddParser,
+    add_options,
+    read_axes,
+    read_numbers,
+    read_scene,
+    read_settings,
+)
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
 from cvtgs.text import counted, printable
 
 if TYPE_CHECKING:
     from cvtgs.analysis import Effect
-    from cvtgs.boxes import Box
-    from cvtgs.edit import Motion
     from cvtgs.info import SceneInfo
     from cvtgs.scene import GaussianScene
 
@@ -87,79 +92,63 @@ def add_edit_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-class SceneEdits:
-    """The edits of a command line: checked on construction, applied to a scene later."""
+Edit = Callable[["GaussianScene"], "GaussianScene"]
 
-    def __init__(self, options: argparse.Namespace) -> None:
-        from cvtgs.boxes import checked_box
-        from cvtgs.edit import Sphere
 
-        self.regions: list[Box | Sphere] = []
-        for text in options.crop_box:
-            numbers = _numbers("--crop-box", text, 6)
-            self.regions.append(checked_box(numbers[:3], numbers[3:], "--crop-box"))
-        for text in options.crop_sphere:
-            x, y, z, radius = _numbers("--crop-sphere", text, 4)
-            self.regions.append(Sphere(center=(x, y, z), radius=radius))
-        self.least, self.largest = options.min_opacity, options.max_size
-        if self.least is not None and not 0 <= self.least <= 1:
-            raise InvalidArgumentError(f"--min-opacity must be from 0 to 1, found {self.least}.")
-        if self.largest is not None and not self.largest > 0:
-            raise InvalidArgumentError(f"--max-size must be above 0, found {self.largest}.")
-        self.motion = _motion(options)
+def read_edits(options: argparse.Namespace) -> list[tuple[str, Edit]]:
+    """Read the edits in their order, each after words for the Gaussians that it drops."""
+    from cvtgs.boxes import Box
+    from cvtgs.edit import Motion, Sphere
 
-    def apply(self, scene: "GaussianScene") -> "tuple[GaussianScene, list[str]]":
-        """Return the edited scene, and one phrase for each kind of lost data."""
-        from cvtgs.validity import lost_step
+    edit, edits, regions = cvtgs.edit, list[tuple[str, Edit]](), list[Box | Sphere]()
+    for text in options.crop_box:
+        numbers = _numbers("--crop-box", text, 6)
+        regions.append(Box(min=tuple(numbers[:3]), max=tuple(numbers[3:])))
+    for text in options.crop_sphere:
+        x, y, z, radius = _numbers("--crop-sphere", text, 4)
+        regions.append(Sphere(center=(x, y, z), radius=radius))
+    if regions:
+        words = "outside --crop-box and --crop-sphere"
+        edits.append((words, lambda scene: edit.crop(scene, regions)))
+    if options.min_opacity is not None:
+        words = "below --min-opacity"
+        edits.append((words, lambda scene: edit.drop_faint(scene, options.min_opacity)))
+    if options.max_size is not None:
+        words = "above --max-size"
+        edits.append((words, lambda scene: edit.drop_large(scene, options.max_size)))
+    if (options.scale, options.rotate, options.translate) != (None, None, None):
+        scale = 1.0 if options.scale is None else options.scale
+        if not 0 < scale < math.inf:
+            raise InvalidArgumentError(f"--scale must be above 0 and finite, found {scale}.")
+        a, b, c = _numbers("--rotate", options.rotate or "0,0,0", 3)
+        x, y, z = _numbers("--translate", options.translate or "0,0,0", 3)
+        motion = Motion.of_angles((a, b, c), scale=scale, shift=(x, y, z))
+        edits.append(("moved", lambda scene: edit.move(scene, motion)))
+    return edits
 
-        phrases = []
-        for phrase, smaller in self._filtered(scene):
-            if len(smaller) < len(scene):
-                phrases.append(f"{counted(len(scene) - len(smaller), 'Gaussian')} ({phrase})")
-            scene = smaller
+
+def _numbers(name: str, text: str, count: int) -> list[float]:
+    return read_numbers(text, (count,), name=name, meaning=_NUMBERS[name])
+
+
+def edited(
+    scene: "GaussianScene", edits: Iterable[tuple[str, Edit]]
+) -> "tuple[GaussianScene, list[str]]":
+    """Return the edited scene, and one phrase for each kind of lost data."""
+    from cvtgs.validity import lost_step
+
+    phrases = []
+    for words, edit in edits:
+        before, scene = scene, edit(scene)
+        if len(scene) < len(before):
+            phrases.append(f"{counted(len(before) - len(scene), 'Gaussian')} ({words})")
+        elif (step := lost_step(scene)) > lost_step(before):
+            phrases.append(f"digits of positions (steps of {step:.3g} so far from the origin)")
         if len(scene) == 0:
             raise InvalidArgumentError(
                 f"at least one Gaussian must be left to write, found none: {'; '.join(phrases)}."
             )
-        if self.motion is not None:
-            moved = cvtgs.edit.move(scene, self.motion)
-            step = lost_step(moved)
-            if step > lost_step(scene):
-                phrases.append(f"digits of positions (steps of {step:.3g} so far from the origin)")
-            scene = moved
-        return scene, phrases
-
-    def _filtered(self, scene: "GaussianScene") -> "Iterator[tuple[str, GaussianScene]]":
-        if self.regions:
-            scene = cvtgs.edit.crop(scene, self.regions)
-            yield "outside --crop-box and --crop-sphere", scene
-        if self.least is not None:
-            scene = cvtgs.edit.drop_faint(scene, self.least)
-            yield "below --min-opacity", scene
-        if self.largest is not None:
-            yield "above --max-size", cvtgs.edit.drop_large(scene, self.largest)
-
-
-def _motion(options: argparse.Namespace) -> "Motion | None":
-    from cvtgs.edit import Motion
-
-    if options.scale is None and options.rotate is None and options.translate is None:
-        return None
-    if options.scale is not None and not 0 < options.scale < math.inf:
-        raise InvalidArgumentError(f"--scale must be above 0 and finite, found {options.scale}.")
-    a, b, c = _numbers("--rotate", options.rotate or "0,0,0", 3)
-    x, y, z = _numbers("--translate", options.translate or "0,0,0", 3)
-    return Motion.of_angles((a, b, c), scale=options.scale or 1.0, shift=(x, y, z))
-
-
-def _numbers(name: str, text: str, count: int) -> list[float]:
-    try:
-        numbers = [float(word) for word in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise InvalidArgumentError(f"{name} must be {_NUMBERS[name]}, found {text!r}.")
-    return numbers
+    return scene, phrases
 
 
 def add_info(add_parser: AddParser) -> None:
@@ -314,7 +303,7 @@ def add_convert(add_parser: AddParser) -> None:
 def convert(options: argparse.Namespace) -> None:
     """Run ``cvtgs convert``."""
     read_axes(options.axes)
-    edits = SceneEdits(options)
+    edits = read_edits(options)
     with open_jobs(options) as jobs:
         for job in jobs:
             cvtgs.io.check_save(job.options.output, overwrite=options.overwrite)
@@ -325,7 +314,7 @@ def convert(options: argparse.Namespace) -> None:
         run_jobs(jobs, lambda job: _convert_one(job, edits))
 
 
-def _convert_one(job: SceneJob, edits: SceneEdits) -> Outcome:
+def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
     """Convert one scene, and report the data that is lost."""
     options = job.options
     axes = read_axes(options.axes)
@@ -343,7 +332,7 @@ def _convert_one(job: SceneJob, edits: SceneEdits) -> Outcome:
             warnings.simplefilter("ignore", DroppedDataWarning)
         scene = scenes[0] if len(scenes) == 1 else cvtgs.edit.merge(scenes)
     left = sorted({name for one in scenes for name in one.extras} - set(scene.extras))
-    scene, phrases = edits.apply(scene)
+    scene, phrases = edited(scene, edits)
     if left:
         phrases.append(f"columns that not all scenes have ({', '.join(map(printable, left))})")
     if options.sh_degree is not None and options.sh_degree < scene.sh_degree:

@@ -66,8 +66,6 @@ def check_goals(options: argparse.Namespace) -> None:
             if getattr(options, option.replace("-", "_")):
                 raise InvalidArgumentError(f"--{option} needs --time-budget.")
         return
-    if options.recalibrate and options.shipped_rates:
-        raise InvalidArgumentError("give either --recalibrate or --shipped-rates, found both.")
     read_seconds(options.time_budget)
     excluded = {
         "--preset": options.preset is not None,

@@ -48,14 +48,14 @@ def add_levels(add_parser: AddParser) -> None:
         "which --no-scores skips.",
     )
     parser.set_defaults(run=levels)
-    add_options(parser, "input", "-o/--output")
-    parser.add_argument(
+    add_options(
+        parser,
+        "input",
+        "-o/--output",
         "--rho",
-        type=ratios,
-        metavar="R,R",
-        help="ratios of Gaussians to keep (default 0.1,0.01,0.001; with --stream "
-        "1,0.25,0.06,0.015)",
+        rho="ratios of Gaussians to keep (default 0.1,0.01,0.001; with --stream 1,0.25,0.06,0.015)",
     )
+    parser.set_defaults(rho=None)
     parser.add_argument(
         "--suffix", metavar="END", type=dotted, help="format of the files (default .ply)"
     )

@@ -1,6 +1,7 @@
 """Options that several commands share, and functions that read their values."""
 
 import argparse
+import math
 import os
 import re
 import sys
@@ -37,21 +38,12 @@ def read_words(text: str) -> list[str]:
 
 def ratios(text: str) -> list[float]:
     """Read a list of ratios, for argparse."""
-    from cvtgs.counts import read_ratio
-
-    words = read_words(text)
-    try:
-        numbers = [read_ratio(word) for word in words]
-    except InvalidArgumentError:
-        numbers = []
-    with _usage_errors():
-        for word, number in zip(words, numbers, strict=False):
-            _check_range(number, word)
-        if not numbers or len(set(numbers)) < len(numbers):
-            raise InvalidArgumentError(
-                f"must be different numbers separated by commas, for example 0.1,0.01 or 10%,1%; "
-                f"found {text!r}."
-            )
+    numbers = [ratio(word) for word in read_words(text)]
+    if not numbers or len(set(numbers)) < len(numbers):
+        raise argparse.ArgumentTypeError(
+            f"must be different numbers separated by commas, for example 0.1,0.01 or 10%,1%; "
+            f"found {text!r}"
+        )
     return numbers
 
 
@@ -61,14 +53,9 @@ def ratio(text: str) -> float:
 
     with _usage_errors():
         number = read_ratio(text)
-        _check_range(number, text)
+        if not 0 < number <= 1:
+            raise InvalidArgumentError(f"rho must be above 0 and at most 1 (100%), found {text!r}.")
         return number
-
-
-def _check_range(number: float, text: str) -> None:
-    """Raise if a ratio is out of range; the message quotes the words that were typed."""
-    if not 0 < number <= 1:
-        raise InvalidArgumentError(f"rho must be above 0 and at most 1 (100%), found {text!r}.")
 
 
 def count(text: str) -> int:
@@ -268,6 +255,17 @@ def add_options(parser: argparse.ArgumentParser, *names: str, **helps: str) -> N
         parser.add_argument(*name.split("/"), **{**_SHARED[name], **texts})
 
 
+def read_numbers(text: str, counts: Sequence[int], *, name: str, meaning: str) -> list[float]:
+    """Read finite numbers separated by commas; raise unless there are as many as one of counts."""
+    try:
+        numbers = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
+        raise InvalidArgumentError(f"{name} must be {meaning}, found {text!r}.")
+    return numbers
+
+
 def dotted(text: str) -> str:
     """Read ``--suffix``, for argparse: spz means .spz."""
     return text if text.startswith(".") else f".{text}"
@@ -292,11 +290,10 @@ def read_axes(text: str | None) -> FileAxes:
 
 def read_settings(words: Sequence[str] = (), effects: str | None = None) -> dict[str, str]:
     """Read ``--set`` and ``--effects`` as settings by dotted key; ``--set`` takes precedence."""
-    example = "--effects needs NAME=VALUE, for example sh=1,mip=off"
-    words_of_effects = [] if effects is None else effects.split(",")
-    if effects and "" in map(str.strip, words_of_effects):
-        raise ConfigError(f"{example}; found {effects!r}.")
-    forced = _assignments(words_of_effects, example)
+    forced = _assignments(
+        [] if effects is None else effects.split(","),
+        "--effects needs NAME=VALUE, for example sh=1,mip=off",
+    )
     settings = {f"effects.{name}": value for name, value in forced.items()}
     settings |= _assignments(words, "--set needs KEY=VALUE, for example cvt.iterations=10")
     known = list(_setting_names(cvtgs.SimplifyConfig))

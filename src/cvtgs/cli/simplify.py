@@ -95,13 +95,14 @@ def add_simplify(add_parser: AddParser) -> None:
         help="use the best preset that is predicted to take at most this time, for example 20s or "
         "2m; the first use measures this machine, which takes about 10 seconds and does not count",
     )
-    parser.add_argument(
+    rates = parser.add_mutually_exclusive_group()
+    rates.add_argument(
         "--shipped-rates",
         action="store_true",
         help="choose the preset for --time-budget by the timings of another machine, shipped with "
         "cvtgs, instead of measuring this one",
     )
-    parser.add_argument(
+    rates.add_argument(
         "--recalibrate", action="store_true", help="measure this machine again for --time-budget"
     )
     add_options(parser, "--preset", "--ckpt", "--config", "--set", "--effects")
@@ -115,15 +116,14 @@ def add_simplify(add_parser: AddParser) -> None:
     parser.add_argument(
         "--refine-steps", type=int, metavar="N", help="step limit of refining the result"
     )
-    parser.add_argument(
+    add_options(
+        parser,
         "--cameras",
-        type=Path,
-        metavar="F",
-        help="cameras to render from, for --refine and for presets that render: "
+        "--split",
+        cameras="cameras to render from, for --refine and for presets that render: "
         f"{CAMERA_FILES} (default: those beside IN or in its folder, if they show the scene, "
         "else automatic views)",
     )
-    add_options(parser, "--split")
     parser.add_argument(
         "--keep",
         type=Path,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import cvtgs
 from cvtgs.cli.blocks import add_block_options, block_workers, memory_of
 from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
-from cvtgs.cli.options import read_axes
+from cvtgs.cli.options import read_axes, read_numbers
 from cvtgs.errors import ConfigError, FileFormatError, InputError, InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -47,13 +47,14 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
         "SOG, which all levels share; in robust radii, one of which holds 70 %% of the Gaussians, "
         "for example 10 for a sky",
     )
-    parser.add_argument(
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument(
         "--place",
         metavar="LON,LAT[,H]",
         help="longitude, latitude (degrees) and height (metres) of the origin of 3D Tiles, with "
         "x to the east and z up",
     )
-    parser.add_argument(
+    place.add_argument(
         "--transform",
         metavar="N,N,...",
         help="column-major transform of the root of 3D Tiles, instead of --place",
@@ -65,22 +66,19 @@ def check_stream_options(options: argparse.Namespace) -> None:
     """Check the options of streams before the long work starts."""
     from cvtgs.streams.files import check_stream
 
-    if options.no_scores and (scoring := _of_scores(options)):
+    scoring = [name for name, default in OF_SCORES.items() if getattr(options, name) != default]
+    if options.no_scores and scoring:
         raise InvalidArgumentError(f"--{scoring[0]} cannot be used with --no-scores.")
     if options.stream is None:
         for name in OF_STREAMS:
             if getattr(options, name) is not None:
                 raise InvalidArgumentError(f"--{name} needs --stream.")
         return
-    if options.viewer:
+    excluded = [name for name in ("viewer", "suffix") if getattr(options, name)] + scoring
+    if excluded:
         raise InvalidArgumentError(
-            "--viewer cannot be used with --stream, which viewers load in chunks."
-        )
-    if options.suffix is not None:
-        raise InvalidArgumentError("--suffix cannot be used with --stream, which sets the format.")
-    if scoring := _of_scores(options):
-        raise InvalidArgumentError(
-            f"--{scoring[0]} cannot be used with --stream, since streams are not scored."
+            f"--{excluded[0]} cannot be used with --stream, which sets the format, is for viewers "
+            f"that load chunks, and is not scored."
         )
     if options.stream == "3dtiles" and read_axes(options.axes).target is not None:
         raise InvalidArgumentError(
@@ -98,11 +96,6 @@ def check_stream_options(options: argparse.Namespace) -> None:
     check_stream(options.output, options.stream, overwrite=options.overwrite)
 
 
-def _of_scores(options: argparse.Namespace) -> list[str]:
-    """Return the options that were given and only apply to scores."""
-    return [name for name, default in OF_SCORES.items() if getattr(options, name) != default]
-
-
 def read_transform(options: argparse.Namespace) -> tuple[float, ...] | None:
     """Read ``--place`` or ``--transform``; return None if neither is given."""
     from cvtgs.streams import geo_transform
@@ -110,28 +103,18 @@ def read_transform(options: argparse.Namespace) -> tuple[float, ...] | None:
 
     if options.place is None and options.transform is None:
         return None
-    if options.stream != "3dtiles" or None not in (options.place, options.transform):
-        raise InvalidArgumentError(
-            "only one of --place and --transform may be given, and it needs --stream 3dtiles."
-        )
+    if options.stream != "3dtiles":
+        raise InvalidArgumentError("--place and --transform need --stream 3dtiles.")
     if options.transform is not None:
-        numbers = _numbers(options.transform, "--transform", (16,))
-        return check_transform(numbers)
-    longitude, latitude, *height = _numbers(options.place, "--place", (2, 3))
-    return geo_transform(longitude, latitude, *height)
-
-
-def _numbers(text: str, name: str, counts: Sequence[int]) -> list[float]:
-    try:
-        numbers = [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in counts:
-        wanted = " or ".join(map(str, counts))
-        raise InvalidArgumentError(
-            f"{name} must be {wanted} numbers separated by commas, found {text!r}."
+        meaning = "16 numbers separated by commas"
+        return check_transform(
+            read_numbers(options.transform, (16,), name="--transform", meaning=meaning)
         )
-    return numbers
+    meaning = "2 or 3 numbers separated by commas"
+    longitude, latitude, *height = read_numbers(
+        options.place, (2, 3), name="--place", meaning=meaning
+    )
+    return geo_transform(longitude, latitude, *height)
 
 
 def stream_blocks(

@@ -34,10 +34,10 @@ def add_view(add_parser: AddParser) -> None:
     parser.add_argument(
         "small", metavar="SMALL", type=Path, nargs="*", help="scenes to switch to, in any format"
     )
-    parser.add_argument(
+    add_options(
+        parser,
         "--preset",
-        metavar="NAME",
-        help=f"preset to start with: {PRESET_NAMES} (default draft, for a responsive slider)",
+        preset=f"preset to start with: {PRESET_NAMES} (default draft, for a responsive slider)",
     )
     parser.add_argument(
         "--rho", type=ratio, metavar="R", default=0.1, help="ratio to start with (default 0.1)"
