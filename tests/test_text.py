@@ -11,12 +11,23 @@ import pytest
 
 import cvtgs
 from cvtgs.cli.main import main
-from cvtgs.text import printable, shown
+from cvtgs.text import printable, shown, size_text
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
 
 CLI = Path(cvtgs.__file__).parent / "cli"
 CLEAR = "\x1b[2J\x1b]0;title\x07"
 linux = pytest.mark.skipif(sys.platform != "linux", reason="names of files that are not UTF-8")
+
+
+def test_size_text():
+    assert [size_text(n) for n in (999, 1500, 999_949, 999_999, 68_000_000, 2_000_000_000)] == [
+        "999 B",
+        "1.5 kB",
+        "999.9 kB",
+        "1.0 MB",
+        "68.0 MB",
+        "2.0 GB",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from cvtgs.evaluation.images import as_bytes, encode
 from cvtgs.rendering import render
 from cvtgs.report import Simplified
 from cvtgs.scene import GaussianScene
+from cvtgs.text import size_text
 from cvtgs.views import automatic_views
 
 WIDTH, HEIGHT = 320, 240
@@ -48,7 +49,7 @@ def _scene_facts(scene: GaussianScene) -> dict[str, str]:
     facts = {
         "Gaussians": f"{len(scene):,}",
         "SH degree": f"{scene.sh_degree}",
-        "memory": f"{size / 1e6:,.1f} MB, {str(scene.dtype).removeprefix('torch.')}",
+        "memory": f"{size_text(size)}, {str(scene.dtype).removeprefix('torch.')}",
         "device": str(scene.device),
     }
     if scene.antialiased:

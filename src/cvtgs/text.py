@@ -52,6 +52,18 @@ def suggestion(word: str, choices: Iterable[str], *, likeness: float = 0.6) -> s
     return f"; did you mean {near[0]}?" if near else ""
 
 
+def size_text(count: int) -> str:
+    """Return a number of bytes as text in decimal units."""
+    if count < 1000:
+        return f"{count} B"
+    value = count / 1000
+    for unit in ("kB", "MB"):
+        if value < 999.95:  # else 1000.0
+            return f"{value:.1f} {unit}"
+        value /= 1000
+    return f"{value:.1f} GB"
+
+
 def padded(text: str, width: int) -> str:
     """Pad a text to a width in columns of a terminal, where wide characters take two."""
     return text + " " * (width - columns(text))

@@ -184,7 +184,7 @@ def test_names_of_wide_and_combining_letters_are_aligned(scenes, tmp_path, capsy
     words = [scenes[0], *(str(tmp_path / name) for name in names), *SMALL, "--lpips", "off"]
     assert main(["evaluate", *words]) == 0
     rows = [line for line in capsys.readouterr().out.splitlines() if ".ply   " in line]
-    assert [row.partition("  200 ")[0].count(" ") for row in rows] == [13, 13, 11]
+    assert [row.partition("  200 ")[0].count(" ") for row in rows] == [10, 10, 8]
 
 
 def test_render_writes_a_png_per_view(scenes, tmp_path, capsys):

@@ -1,13 +1,9 @@
 """``cvtgs info`` and ``cvtgs demo``."""
 
-import io
-import sys
-
 import pytest
 
 import cvtgs
 from cvtgs.cli import demo
-from cvtgs.cli.display import size_text
 from cvtgs.cli.main import main
 from cvtgs.mergenet import (
     Architecture,
@@ -106,31 +102,10 @@ def test_demo_writes_three_scenes_and_a_page_and_prints_next_steps(tmp_path, cap
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.parametrize(("encoding", "rule"), [("utf-8", "\u2500"), ("cp1252", "-")])
-def test_the_table_of_the_demo_fits_the_encoding_of_the_output(monkeypatch, encoding, rule):
-    output = io.BytesIO()
-    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(output, encoding=encoding))
-    demo._print_table([{"file": "full.ply", "size": "1 kB"}, {"file": "small.ply", "size": "1 B"}])
-    sys.stdout.flush()
-    lines = output.getvalue().decode(encoding).splitlines()
-    assert set(lines[2].strip()) == {rule}
-
-
 def test_demo_refuses_a_folder_that_cannot_be_created(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert main(["demo", "-o", str(tmp_path / "file" / "demo"), "--count", "10"]) == 1
     assert "must be a folder or a new path" in capsys.readouterr().err
-
-
-def test_size_text():
-    assert [size_text(n) for n in (999, 1500, 999_949, 999_999, 68_000_000, 2_000_000_000)] == [
-        "999 B",
-        "1.5 kB",
-        "999.9 kB",
-        "1.0 MB",
-        "68.0 MB",
-        "2.0 GB",
-    ]
 
 
 def test_demo_replaces_only_files_of_an_earlier_demo(tmp_path, capsys):

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import cvtgs
-from cvtgs.cli.display import size_text
 from cvtgs.cli.main import main
+from cvtgs.text import size_text
 from format_cases import DATA
 
 NAMES = ("a.ply", "b.compressed.ply", "c.spz")

@@ -3,23 +3,6 @@
 import pytest
 
 from cvtgs.evaluation import comparison_files
-from cvtgs.evaluation.comparison_files import bytes_text
-
-
-@pytest.mark.parametrize(
-    ("count", "text"),
-    [
-        (999, "999 B"),
-        (99_949, "99.9 kB"),
-        (99_960, "100 kB"),
-        (999_499, "999 kB"),
-        (999_999, "1.0 MB"),
-        (250_000_000, "250 MB"),
-        (5 * 10**12, "5000 GB"),
-    ],
-)
-def test_byte_counts_as_text(count, text):
-    assert bytes_text(count) == text
 
 
 @pytest.mark.parametrize(

@@ -172,7 +172,7 @@ def test_the_texts_of_the_table():
         "alpha error": "",
         "alpha bias": "",
         "file": "4.2 kB",
-        "memory": "300 MB",
+        "memory": "300.0 MB",
     }
     covered = result("draft", 2.0, 20.0, alpha_error=0.0123, alpha_bias=-0.01)
     assert cells(made, covered)["alpha error"] == "0.0123"

@@ -2,7 +2,7 @@
 
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TextIO
 import cvtgs
 from cvtgs.errors import OutputError, reason_of
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.text import counted, printable
+from cvtgs.text import columns, counted, padded, printable, size_text
 
 if TYPE_CHECKING:
     from cvtgs.budget import Found
@@ -71,25 +71,12 @@ def say_wrapped(text: str, *, file: TextIO | None = None, indent: int = 0) -> No
         say(line.replace(TIE, " "), file=file)
 
 
-def without_middle(text: str, width: int) -> str:
-    """Return a text; replace its middle by dots if it is longer than the width."""
-    text = printable(text)
-    if len(text) <= width:
-        return text
-    head = (width - 3) // 2
-    return f"{text[:head]}...{text[len(text) - (width - 3 - head) :]}"
-
-
-def size_text(count: int) -> str:
-    """Return a number of bytes as text in decimal units."""
-    if count < 1000:
-        return f"{count} B"
-    value = count / 1000
-    for unit in ("kB", "MB"):
-        if value < 999.95:  # else 1000.0
-            return f"{value:.1f} {unit}"
-        value /= 1000
-    return f"{value:.1f} GB"
+def say_table(rows: Sequence[Sequence[str]]) -> None:
+    """Print rows of cells; the first column is aligned to the left, the others to the right."""
+    widths = [max(map(columns, column)) for column in zip(*rows, strict=True)]
+    for first, *others in rows:
+        cells = (f"{text:>{width}}" for text, width in zip(others, widths[1:], strict=True))
+        say(f"  {padded(first, widths[0])}  {'  '.join(cells)}".rstrip())
 
 
 def file_size(path: Path) -> str:

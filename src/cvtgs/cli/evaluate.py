@@ -16,14 +16,14 @@ from cvtgs.cli.cameras import (
     evaluation_settings,
     read_photographs,
 )
-from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
+from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped
 from cvtgs.cli.jobs import expanded
 from cvtgs.cli.options import CAMERA_FILES, AddParser, add_options, read_words
 from cvtgs.cli.view import PAGE, check_page, write_page
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import windows_fault
 from cvtgs.progress import ProgressEvent
-from cvtgs.text import columns, counted, padded, printable
+from cvtgs.text import counted, printable, size_text
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation, SceneScores
@@ -187,22 +187,17 @@ def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
 
 
 def _print_score_table(scenes: "tuple[SceneScores, ...]", sizes: dict[str, int]) -> None:
-    width = max(columns(scene.name) for scene in scenes)
-    heads = (
-        f"  {'':{width}}  {'Gaussians':>12}  {'size':>9}  {'PSNR':>6}  {'SSIM':>6}  {'LPIPS':>6}"
-    )
-    with_alpha = all(scene.alpha_error for scene in scenes)
-    say(f"{heads}  {'alpha':>6}  {'bias':>7}" if with_alpha else heads)
+    rows = [["", "Gaussians", "size", "PSNR", "SSIM", "LPIPS"]]
+    if scenes[0].alpha_error:
+        rows[0] += ["alpha", "bias"]
     for scene in scenes:
-        distance = f"{scene.lpips.mean:.4f}" if scene.lpips else "-"
-        name = padded(scene.name, width)
-        line = (
-            f"  {name}  {scene.count:>12,}  {size_text(sizes[scene.name]):>9}  "
-            f"{scene.psnr.mean:>6.2f}  {scene.ssim.mean:>6.4f}  {distance:>6}"
-        )
+        size, lpips = size_text(sizes[scene.name]), scene.lpips
+        row = [scene.name, f"{scene.count:,}", size, f"{scene.psnr.mean:.2f}"]
+        row += [f"{scene.ssim.mean:.4f}", f"{lpips.mean:.4f}" if lpips else "-"]
         if scene.alpha_error and scene.alpha_bias:
-            line += f"  {scene.alpha_error.mean:>6.4f}  {scene.alpha_bias.mean:>+7.4f}"
-        say(line)
+            row += [f"{scene.alpha_error.mean:.4f}", f"{scene.alpha_bias.mean:+.4f}"]
+        rows.append(row)
+    say_table(rows)
 
 
 def add_compare(add_parser: AddParser) -> None:
@@ -323,10 +318,6 @@ def _print_tradeoff(tradeoff: "Tradeoff") -> None:
     for rho in tradeoff.ratios:
         say(heading(tradeoff, rho))
         runs = [cells(tradeoff, result) for result in tradeoff.results if result.rho == rho]
-        left = max(len(name) for name in runs[0])
-        widths = [max(map(len, run.values())) for run in runs]
-        for name in runs[0]:
-            words = (f"{run[name]:>{width}}" for run, width in zip(runs, widths, strict=True))
-            say(f"  {name:{left}}  {'  '.join(words)}".rstrip())
+        say_table([[name, *(run[name] for run in runs)] for name in runs[0]])
     say(MARK_MEANS)
     say_wrapped(how_measured(tradeoff))

@@ -18,8 +18,6 @@ from cvtgs.cli.display import (
     say,
     say_wrapped,
     send_file,
-    size_text,
-    without_middle,
 )
 from cvtgs.cli.options import READABLE, WRITABLE, CommandParser, dotted, is_same_file
 from cvtgs.errors import (
@@ -30,7 +28,7 @@ from cvtgs.errors import (
     OutputError,
     RunError,
 )
-from cvtgs.text import counted, printable, shortened, shown
+from cvtgs.text import counted, printable, shortened, shown, size_text
 
 STREAM = "-"
 """The path that stands for standard input or output."""
@@ -179,7 +177,7 @@ def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> N
             sizes = f"{size_text(bytes_in)} -> {size_text(bytes_out)}"
             facts = ", ".join(filter(None, (outcome.counts, sizes, outcome.seconds)))
             room = max(8, WIDTH - len(place) - len(facts) - 2)
-            say(f"{place}{without_middle(target.name, room)}: {facts}", flush=True)
+            say(f"{place}{shortened(printable(target.name), room)}: {facts}", flush=True)
             for note in outcome.notes:
                 say_wrapped(note, indent=len(place))
     done = len(jobs) - failed

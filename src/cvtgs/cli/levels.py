@@ -11,7 +11,7 @@ from cvtgs.cli.cameras import (
     choose_cameras,
     evaluation_settings,
 )
-from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
+from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped
 from cvtgs.cli.jobs import check_suffix
 from cvtgs.cli.options import (
     AddParser,
@@ -25,7 +25,7 @@ from cvtgs.cli.options import (
 )
 from cvtgs.cli.streams import add_stream_options, check_stream_options, stream_blocks, stream_levels
 from cvtgs.cli.view import check_page, write_page
-from cvtgs.text import printable
+from cvtgs.text import printable, size_text
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation
@@ -157,16 +157,12 @@ def _score(
 
 
 def _print_index(index: "LevelsIndex") -> None:
-    width = max(len(level.file) for level in index.levels)
     say(f"{index.source}, {index.source_count:,} Gaussians:")
-    say(
-        f"  {'':{width}}  {'Gaussians':>12}  {'size':>9}  {'error':>9}  {'PSNR':>6}  "
-        f"{'alpha':>6}  seconds"
-    )
+    rows = [["", "Gaussians", "size", "error", "PSNR", "alpha", "seconds"]]
     for level in index.levels:
         psnr = "-" if level.psnr is None else f"{level.psnr:.2f}"
         alpha = "-" if level.alpha_error is None else f"{level.alpha_error:.4f}"
-        say(
-            f"  {level.file:{width}}  {level.count:>12,}  {size_text(level.bytes):>9}  "
-            f"{level.geometric_error:>9.3g}  {psnr:>6}  {alpha:>6}  {level.seconds:.2f}"
-        )
+        error, seconds = f"{level.geometric_error:.3g}", f"{level.seconds:.2f}"
+        size = size_text(level.bytes)
+        rows.append([level.file, f"{level.count:,}", size, error, psnr, alpha, seconds])
+    say_table(rows)

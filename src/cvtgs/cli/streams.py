@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.blocks import add_block_options, block_workers, memory_of
-from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
+from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped
 from cvtgs.cli.options import read_axes, read_numbers
 from cvtgs.errors import ConfigError, FileFormatError, InputError, InvalidArgumentError
+from cvtgs.text import size_text
 
 if TYPE_CHECKING:
     from cvtgs.cli.options import FileAxes
@@ -225,10 +226,11 @@ def _print_levels(
         return
     number = "one chunk" if chunks == 1 else f"{chunks:,} chunks"
     say(f"{options.input.name} in {number}{more}, the finest level first:")
-    say(f"  {'Gaussians':>12}  {'size':>9}  {'files':>6}" + f"  {'error':>9}" * bool(errors))
+    rows = [["", "Gaussians", "size", "files", "error" if errors else ""]]
     for one, error in zip_longest(levels, errors):
-        last = "" if error is None else f"  {error:>9.3g}"
-        say(f"  {one.gaussians:>12,}  {size_text(one.bytes):>9}  {one.files:>6,}{last}")
+        last = "" if error is None else f"{error:.3g}"
+        rows.append(["", f"{one.gaussians:,}", size_text(one.bytes), f"{one.files:,}", last])
+    say_table(rows)
     if options.environment is not None:
         say_wrapped(
             f"Not counted: the environment beyond {options.environment:g} times the robust radius, "

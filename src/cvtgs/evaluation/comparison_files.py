@@ -29,7 +29,7 @@ from cvtgs.evaluation.scorer import SceneScores
 from cvtgs.io import atomic_output, check_output
 from cvtgs.io.atomic import make_folder
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.text import counted
+from cvtgs.text import counted, size_text
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -120,7 +120,7 @@ class _Row(NamedTuple):
 def contact_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
     """Draw all views of all scenes: a row per scene, the full one first; a column per view."""
     evaluation = comparison.evaluation
-    size = bytes_text(comparison.sizes.get(evaluation.reference))
+    size = _size_text(comparison, evaluation.reference)
     full = [counted(evaluation.reference_count, "Gaussian"), size]
     rows = [_Row(evaluation.reference, full, comparison.full.colors)]
     rows += [
@@ -162,7 +162,7 @@ def _small_row(comparison: Comparison, scores: SceneScores, images: Images) -> _
     lines = [
         counted(scores.count, "Gaussian"),
         _ratio_text(comparison.ratio(scores)),
-        bytes_text(comparison.sizes.get(scores.name)),
+        _size_text(comparison, scores.name),
         f"PSNR {_psnr_text(scores.psnr.mean)}",
         f"SSIM {scores.ssim.mean:.3f}",
         f"LPIPS {scores.lpips.mean:.3f}" if scores.lpips else "",
@@ -243,16 +243,8 @@ def _psnr_text(value: float) -> str:
     return "equal" if math.isinf(value) else f"{value:.2f} dB"
 
 
-def bytes_text(count: int | None) -> str:
-    """Format a number of bytes in decimal units; return "" for None."""
-    if count is None:
-        return ""
-    value, unit = float(count), "B"
-    for larger in ("kB", "MB", "GB"):
-        if value < 999.5:  # else 1000
-            break
-        value, unit = value / 1000, larger
-    return f"{value:.0f} {unit}" if unit == "B" or value >= 99.95 else f"{value:.1f} {unit}"
+def _size_text(comparison: Comparison, name: str) -> str:
+    return size_text(comparison.sizes[name]) if name in comparison.sizes else ""
 
 
 def _ratio_text(ratio: float) -> str:

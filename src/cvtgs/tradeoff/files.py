@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cvtgs.errors import MissingDependencyError
-from cvtgs.evaluation.comparison_files import PAGE, bytes_text, comparison_page, render_template
+from cvtgs.evaluation.comparison_files import PAGE, comparison_page, render_template
 from cvtgs.io import atomic_output, check_output
 from cvtgs.io.atomic import make_folder
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.text import counted
+from cvtgs.text import counted, size_text
 from cvtgs.tradeoff.measure import Measured
 from cvtgs.tradeoff.results import Tradeoff, TradeoffResult
 
@@ -217,8 +217,8 @@ def cells(tradeoff: Tradeoff, result: TradeoffResult) -> Mapping[str, str]:
         **_against_photograph(tradeoff, result.name),
         "alpha error": "" if result.alpha_error is None else f"{result.alpha_error:.4f}",
         "alpha bias": "" if result.alpha_bias is None else f"{result.alpha_bias:+.4f}",
-        "file": bytes_text(result.bytes),
-        "memory": bytes_text(result.peak_memory_bytes) if result.peak_memory_bytes else "",
+        "file": size_text(result.bytes),
+        "memory": size_text(result.peak_memory_bytes) if result.peak_memory_bytes else "",
     }
 
 

@@ -16,7 +16,7 @@ from cvtgs.prepared import Prepared
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
 from cvtgs.simplifier import Simplifier
-from cvtgs.text import counted
+from cvtgs.text import counted, size_text
 from cvtgs.validity import valid_part
 
 __all__ = ["SceneViewer", "ShownScene"]
@@ -155,8 +155,8 @@ class SceneViewer:
 
 def _counted(scene: GaussianScene, full: GaussianScene) -> str:
     columns = 17 + 3 * scene.shN.shape[1]
-    size = 4e-6 * columns * len(scene)
-    return f"{len(scene):,} of {counted(len(full), 'Gaussian')}, {size:,.3g} MB as .ply"
+    size = size_text(4 * columns * len(scene))
+    return f"{len(scene):,} of {counted(len(full), 'Gaussian')}, {size} as .ply"
 
 
 def camera_of(
