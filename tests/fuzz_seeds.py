@@ -17,7 +17,6 @@ from camera_files import colmap_bin, colmap_txt, inria, transforms
 from cvtgs import SimplifyConfig
 from cvtgs.boxes import read_boxes
 from cvtgs.io.sog import encode_sog
-from cvtgs.levels import read_index
 from cvtgs.mergenet import Architecture, CheckpointInfo, load_checkpoint, save_checkpoint
 from cvtgs.train import TrainConfig
 from mergenet_cases import lively_net
@@ -159,15 +158,6 @@ def seeds_of_trainings() -> list[bytes]:
     return [path.read_bytes() for path in sorted((HERE.parent / "recipes").glob("*.toml"))]
 
 
-def seeds_of_levels() -> list[bytes]:
-    """Return the index of two levels."""
-    scene = random_scene(20, degree=0)
-    made = cvtgs.Simplifier(preset="draft", device="cpu").levels(scene, [0.5, 0.1])
-    with tempfile.TemporaryDirectory() as folder:
-        cvtgs.levels.write_levels(made, folder, rhos=[0.5, 0.1], source="a.ply")
-        return [(Path(folder) / cvtgs.levels.INDEX_NAME).read_bytes()]
-
-
 def colmap_files(write: Callable[[Path], object]) -> Files:
     """Return the files of a COLMAP model."""
     with tempfile.TemporaryDirectory() as folder:
@@ -207,7 +197,6 @@ READERS: dict[str, Kind] = {
     "config": Kind(name=".toml", seeds=seeds_of_configs, read=SimplifyConfig.from_toml),
     "boxes": Kind(name=".json", seeds=seeds_of_boxes, read=read_boxes),
     "training": Kind(name=".toml", seeds=seeds_of_trainings, read=TrainConfig.from_toml),
-    "levels": Kind(name="levels.json", seeds=seeds_of_levels, read=read_index),
     "ksplat": Kind(name=".ksplat", seeds=seeds_of_ksplat, read=cvtgs.load),
     "meta": Kind(
         name="meta.json",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cvtgs.errors import InvalidArgumentError, MissingDependencyError
+from cvtgs.errors import MissingDependencyError
 from cvtgs.plots import COLORS, Panel, Series, _cost, _shared, _styles, line_chart
 
 needs_matplotlib = pytest.mark.skipif(
@@ -100,12 +100,6 @@ def test_more_names_than_colours_and_styles_still_look_different():
         for name in ("0", "24")
     )
     assert first != last
-
-
-def test_more_names_than_styles_is_an_error():
-    many = [Series(name=str(number), x=[0], y=[0]) for number in range(217)]
-    with pytest.raises(InvalidArgumentError, match="at most 216 names, found 217"):
-        line_chart([Panel(series=many)])
 
 
 @needs_matplotlib

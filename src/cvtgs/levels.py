@@ -5,19 +5,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
 
-import pydantic
 import torch
 
 from cvtgs.boxes import Corner
-from cvtgs.config.base import Record, explain
+from cvtgs.config.base import Record
 from cvtgs.counts import written
-from cvtgs.errors import FileFormatError, InvalidArgumentError
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import Evaluation, SceneScores
 from cvtgs.evaluation.scorer import mean_of
 from cvtgs.io import atomic_output, check_output, check_save, load, save
 from cvtgs.io.atomic import make_folder
 from cvtgs.io.axes import SCENE_AXES
-from cvtgs.io.files import open_input
 from cvtgs.report import Level
 from cvtgs.text import printable
 
@@ -141,23 +139,17 @@ def level_names(rhos: Sequence[float], suffix: str = ".ply") -> tuple[str, ...]:
 def check_levels(
     folder: str | os.PathLike[str], names: Sequence[str], *, overwrite: bool = False
 ) -> None:
-    """Check that levels can be written, before any long computation."""
+    """Make the folder and check that levels can be written, before any long computation."""
     for name in names:
         if name.lower().endswith(".usda"):  # the only write-only format
             raise InvalidArgumentError(
                 "levels need a format that cvtgs can also read, found '.usda'; write them as "
                 ".ply and convert those files."
             )
-    place = Path(folder)
-    if not os.path.exists(place):  # noqa: PTH110 (false for impossible names)
-        check_output(place)  # its parent is there and writable
-        for name in names:
-            check_save(place.parent / f".{name}", overwrite=True)
-        return
-    make_folder(place)  # raises for a file
+    make_folder(folder)
     for name in names:
-        check_save(place / name, overwrite=overwrite)
-    check_output(place / INDEX_NAME, overwrite=overwrite)
+        check_save(Path(folder) / name, overwrite=overwrite)
+    check_output(Path(folder) / INDEX_NAME, overwrite=overwrite)
 
 
 def write_levels(
@@ -212,7 +204,6 @@ def write_levels(
             f"rhos must differ, since they name the files, found {twice[0]} twice."
         )
     check_levels(place, names, overwrite=overwrite)
-    place.mkdir(exist_ok=True)
     entries = []
     for level, rho, name in zip(levels, rhos, names, strict=True):
         save(level.scene, place / name, overwrite=overwrite, axes=axes)
@@ -226,28 +217,16 @@ def write_levels(
     return index
 
 
-def add_scores(folder: str | os.PathLike[str], evaluation: Evaluation) -> LevelsIndex:
-    """Add scores to the index of levels on disk."""
-    place = Path(folder)
-    index = read_index(place / INDEX_NAME)
+def add_scores(index: LevelsIndex, folder: Path, evaluation: Evaluation) -> LevelsIndex:
+    """Add scores to the index of levels, also on disk."""
     scores = {one.name: one for one in evaluation.scenes}
     levels = tuple(
         level.with_scores(scores[level.file]) if level.file in scores else level
         for level in index.levels
     )
     index = index.model_copy(update={"levels": levels, "views": len(evaluation.views)})
-    _write_index(index, place, overwrite=True)
+    _write_index(index, folder, overwrite=True)
     return index
-
-
-def read_index(path: Path) -> LevelsIndex:
-    """Read the index of levels."""
-    with open_input(path) as file:
-        content = file.read()
-    try:
-        return LevelsIndex.model_validate_json(content)
-    except pydantic.ValidationError as error:
-        raise FileFormatError(f"{path}: is not an index of levels: {explain(error)}") from error
 
 
 def _write_index(index: LevelsIndex, folder: Path, *, overwrite: bool) -> None:

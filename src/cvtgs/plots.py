@@ -4,10 +4,12 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import cycle, product
 from typing import Any
 
-from cvtgs.errors import InvalidArgumentError, MissingDependencyError, how_to_install
+import numpy as np
+
+from cvtgs.errors import MissingDependencyError, how_to_install
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 """Palette of Okabe and Ito 2008, distinct with any colour vision."""
@@ -120,14 +122,11 @@ def _figure(width: float, height: float) -> Any:
 def _styles(panels: Sequence[Panel]) -> dict[str, dict[str, str]]:
     """Return a style for every name, assigned in order of appearance."""
     names = dict.fromkeys(series.name for panel in panels for series in panel.series)
-    most = len(COLORS) * len(STYLES) * len(MARKERS)
-    if len(names) > most:
-        raise InvalidArgumentError(f"a chart shows at most {most} names, found {len(names)}.")
     styles = [
         {"color": color, "linestyle": style, "marker": marker}
         for marker, style, color in product(MARKERS, STYLES, COLORS)
     ]
-    return dict(zip(names, styles, strict=False))
+    return dict(zip(names, cycle(styles), strict=False))
 
 
 def _draw(axes: Any, panel: Panel, styles: dict[str, dict[str, str]]) -> dict[str, Any]:
@@ -136,13 +135,13 @@ def _draw(axes: Any, panel: Panel, styles: dict[str, dict[str, str]]) -> dict[st
         style = dict(styles[series.name])
         if not series.markers and len(series.y) > 1 and style["marker"] == MARKERS[0]:
             del style["marker"]
-        hollow = series.hollow or [False] * len(series.y)
-        points = list(zip(series.x, map(_or_gap, series.y), hollow, strict=True))
-        x, y = _columns([point for point in points if not point[2]])
-        (lines[series.name],) = axes.plot(x, y, **style)
-        if any(hollow):
+        x, y = np.array(series.x), np.array(series.y, dtype=np.float64)
+        y[~np.isfinite(y)] = np.nan
+        hollow = np.array(series.hollow or [False] * len(y))
+        (lines[series.name],) = axes.plot(x[~hollow], y[~hollow], **style)
+        if hollow.any():
             style |= {"linestyle": "", "marker": styles[series.name]["marker"]}
-            axes.plot(*_columns([point for point in points if point[2]]), mfc="white", **style)
+            axes.plot(x[hollow], y[hollow], mfc="white", **style)
     axes.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
     if panel.log_x:
         axes.set_xscale("log")
@@ -155,14 +154,6 @@ def _draw(axes: Any, panel: Panel, styles: dict[str, dict[str, str]]) -> dict[st
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     return lines
-
-
-def _or_gap(value: float) -> float:
-    return value if math.isfinite(value) else math.nan
-
-
-def _columns(points: Sequence[tuple[float, float, bool]]) -> tuple[list[float], list[float]]:
-    return [point[0] for point in points], [point[1] for point in points]
 
 
 def _write_labels(axes: Any, panel: Panel) -> None:

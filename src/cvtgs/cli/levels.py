@@ -126,7 +126,7 @@ def levels(options: argparse.Namespace) -> None:
                 for name in names
             }
             evaluation = _score(options, scene, files, listener)
-            index = cvtgs.levels.add_scores(options.output, evaluation)
+            index = cvtgs.levels.add_scores(index, options.output, evaluation)
     if not options.quiet:
         _print_index(index)
         older = {path.name for path in options.output.glob("rho_*")} - set(names)

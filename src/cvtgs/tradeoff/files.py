@@ -165,19 +165,16 @@ def tradeoff_chart(tradeoff: Tradeoff) -> bytes:
 
 def ticks(low: float, high: float) -> Sequence[float]:
     """Return ticks for a logarithmic axis: 1, 2, 3, 5, 7 times powers of ten, or fewer."""
+    low, high = max(low, 1e-3), max(high, 1e-3)
+    decades = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)
     for digits in DIGITS:
-        found = _round_numbers(max(low, 1e-3), max(high, 1e-3), digits)
+        steps = [float(f"{digit}e{decade}") for decade in decades for digit in digits]
+        first = max((step for step in steps if step <= low), default=steps[0])
+        last = min((step for step in steps if step >= high), default=steps[-1])
+        found = [step for step in steps if first <= step <= last]
         if len(found) <= MOST_TICKS:
             break
     return found
-
-
-def _round_numbers(low: float, high: float, digits: Sequence[int]) -> Sequence[float]:
-    decades = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)
-    steps = [float(f"{digit}e{decade}") for decade in decades for digit in digits]
-    first = max((step for step in steps if step <= low), default=steps[0])
-    last = min((step for step in steps if step >= high), default=steps[-1])
-    return [step for step in steps if first <= step <= last]
 
 
 def page_summary(tradeoff: Tradeoff, chart: bytes | None) -> str:
