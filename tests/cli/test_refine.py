@@ -56,9 +56,18 @@ def test_refinement_is_off_by_default(source, tmp_path):
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--refine", "-1"], "--refine and --refine-steps must be at least 0, found -1."),
-        (["--refine", "nan"], "--refine and --refine-steps must be at least 0, found nan."),
-        (["--refine-steps", "-2"], "--refine and --refine-steps must be at least 0, found -2."),
+        (
+            ["--refine", "-1"],
+            "refine.seconds: input should be greater than or equal to 0, found '-1.0'.",
+        ),
+        (
+            ["--refine", "nan"],
+            "refine.seconds: input should be a finite number, found 'nan'.",
+        ),
+        (
+            ["--refine-steps", "-2"],
+            "refine.steps: input should be greater than or equal to 0, found '-2'.",
+        ),
     ],
 )
 def test_invalid_limits_are_refused_before_the_work(tmp_path, capsys, words, text):

@@ -2,15 +2,14 @@
 
 import argparse
 import platform
-import time
 from importlib import metadata
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import cvtgs
 from cvtgs.cli.display import say
 from cvtgs.cli.options import AddParser, add_options
 from cvtgs.errors import CvtgsError, DeviceError
+from cvtgs.progress import silent
 
 if TYPE_CHECKING:
     import torch
@@ -126,28 +125,28 @@ def _small_run(device: "torch.device") -> list[str]:
     """Generate, simplify and render a scene; return a line with the time of each step."""
     import torch
 
-    times = [time.perf_counter()]
-    scene = cvtgs.synthetic.demo_scene(COUNT, sh_degree=1)
-    times.append(time.perf_counter())
-    small, report = cvtgs.Simplifier(device=device).run(scene, RHO)
-    times.append(time.perf_counter())
-    cameras = cvtgs.views.automatic_views(small, 1, width=SIDE, height=SIDE)
-    times.append(time.perf_counter())
-    with torch.no_grad():
+    from cvtgs.clock import StageClock
+
+    clock = StageClock(silent, device)
+    with clock.stage("generate"):
+        scene = cvtgs.synthetic.demo_scene(COUNT, sh_degree=1)
+    with clock.stage("simplify"):
+        small, report = cvtgs.Simplifier(device=device).run(scene, RHO)
+    with clock.stage("views"):
+        cameras = cvtgs.views.automatic_views(small, 1, width=SIDE, height=SIDE)
+    with clock.stage("render"), torch.no_grad():
         image = cvtgs.render(small.to(device), cameras)
-    color = float(image.rgb.mean())
-    times.append(time.perf_counter())
+        color = float(image.rgb.mean())
     if len(small) != report.target_count or not 0.0 < color < 1.0:
         raise DeviceError(
             f"the result has {len(small):,} Gaussians and a mean colour of {color:.3g}"
         )
-    generated, simplified, viewed, rendered = (after - before for before, after in pairwise(times))
     compiles = image.backend == "numba"
-    note = "   numba compiles for about ten seconds at its first use" if compiles else ""
-    return [
-        f"generate  {generated:6.2f} s",
-        f"simplify  {simplified:6.2f} s   search by {report.backend}, "
-        f"checkpoint {report.checkpoint}",
-        f"views     {viewed:6.2f} s{note}",
-        f"render    {rendered:6.2f} s   {SIDE} x {SIDE} pixels by {image.backend}",
-    ]
+    notes = (
+        "",
+        f"   search by {report.backend}, checkpoint {report.checkpoint}",
+        "   numba compiles for about ten seconds at its first use" if compiles else "",
+        f"   {SIDE} x {SIDE} pixels by {image.backend}",
+    )
+    costs = zip(clock.costs, notes, strict=True)
+    return [f"{cost.stage:<9} {cost.seconds:6.2f} s{note}" for cost, note in costs]

@@ -166,10 +166,12 @@ def add_info(add_parser: AddParser) -> None:
 
 def show_info(options: argparse.Namespace) -> None:
     """Run ``cvtgs info``."""
-    if is_checkpoint(options.input):
+    path = options.input
+    is_shipped = str(path) in cvtgs.mergenet.SHIPPED and not path.exists()
+    if is_shipped or path.suffix == ".safetensors":
         if options.effects is not None:
             raise InvalidArgumentError("--effects applies to scenes, and cannot be used here.")
-        show_checkpoint(options.input, as_json=options.json)
+        show_checkpoint(path, as_json=options.json)
         return
     settings = read_settings(effects=options.effects)
     config = cvtgs.SimplifyConfig.compose(settings=settings)
@@ -183,12 +185,6 @@ def show_info(options: argparse.Namespace) -> None:
         return
     for label, text in [("file", file), *_rows(facts)]:
         say(f"{label:<16} {text}")
-
-
-def is_checkpoint(path: Path) -> bool:
-    """Return whether a path is the name of a shipped checkpoint or a ``.safetensors`` file."""
-    shipped = str(path) in cvtgs.mergenet.SHIPPED and not path.exists()
-    return shipped or path.suffix == ".safetensors"
 
 
 def show_checkpoint(path: Path, *, as_json: bool) -> None:
@@ -230,7 +226,13 @@ def _rows(facts: "SceneInfo") -> list[tuple[str, str]]:
         ("SH degree", f"{facts.sh_degree}"),
         ("bounds", f"{_vector(facts.bounds[0])} to {_vector(facts.bounds[1])}"),
         ("robust radius", f"{facts.robust_radius:.4g} around {_vector(facts.robust_center)}"),
-        ("opacity at", _labelled(QUANTILES, facts.opacity_quantiles, "{:.0%} {:.3f}")),
+        (
+            "opacity at",
+            "   ".join(
+                f"{share:.0%} {value:.3f}"
+                for share, value in zip(QUANTILES, facts.opacity_quantiles, strict=True)
+            ),
+        ),
         ("mass", f"{facts.mass:.4g} square units"),
         (
             "mass shares",
@@ -266,10 +268,6 @@ def _effect_cells(effect: "Effect") -> tuple[str, str, str]:
         state += f", to degree {effect.degree}" if effect.active else ""
         figures = ", ".join(f"{loss:.3g}" for loss in effect.bands)
     return state + (", forced" if effect.forced else ""), figures, effect.meaning
-
-
-def _labelled(shares: tuple[float, ...], values: tuple[float, ...], form: str) -> str:
-    return "   ".join(form.format(*pair) for pair in zip(shares, values, strict=True))
 
 
 def _vector(values: tuple[float, ...]) -> str:

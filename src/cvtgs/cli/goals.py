@@ -33,19 +33,12 @@ class ChosenPreset(NamedTuple):
     name: str
     reason: str
     left: float
-    is_measured: bool
-    """Whether the choice is by timings of this machine."""
 
     def late_note(self, seconds: float) -> list[str]:
         """Return a sentence if a run took longer than the time that was left."""
-        if seconds <= self.left:
-            return []
-        advice = (
-            "--recalibrate measures this machine again"
-            if self.is_measured
-            else "without --shipped-rates, cvtgs measures this machine"
-        )
-        return [f"The run took {seconds:.1f} s, where {self.left:.1f} s were left; {advice}."]
+        took = f"The run took {seconds:.1f} s, where {self.left:.1f} s were left"
+        advice = "--recalibrate measures this machine again"
+        return [f"{took}; {advice}."] if seconds > self.left else []
 
 
 def has_target(options: argparse.Namespace) -> bool:
@@ -137,7 +130,7 @@ def choose_preset(
         f"Preset {choice.preset}, the best that fits into {budget:g} s: expected to take "
         f"{choice.seconds:.1f} s after {spent:.1f} s of starting and reading."
     )
-    return ChosenPreset(choice.preset, reason, budget - spent, not options.shipped_rates)
+    return ChosenPreset(choice.preset, reason, budget - spent)
 
 
 def search_target(

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import cvtgs
 from cvtgs.cli.display import (
     WIDTH,
-    file_size,
     say,
     say_wrapped,
     send_file,
@@ -43,6 +42,11 @@ class Outcome(NamedTuple):
     counts: str
     seconds: str = ""
     notes: Sequence[str] = ()
+
+    def facts(self, before: int, after: int) -> str:
+        """Return counts, bytes and seconds in one line."""
+        sizes = f"{size_text(before)} -> {size_text(after)}"
+        return ", ".join(filter(None, (self.counts, sizes, self.seconds)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -174,8 +178,7 @@ def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> N
         bytes_out = cvtgs.io.scene_size(target)
         before, after = before + bytes_in, after + bytes_out
         if not quiet:
-            sizes = f"{size_text(bytes_in)} -> {size_text(bytes_out)}"
-            facts = ", ".join(filter(None, (outcome.counts, sizes, outcome.seconds)))
+            facts = outcome.facts(bytes_in, bytes_out)
             room = max(8, WIDTH - len(place) - len(facts) - 2)
             say(f"{place}{shortened(printable(target.name), room)}: {facts}", flush=True)
             for note in outcome.notes:
@@ -195,7 +198,7 @@ def _run_one(job: SceneJob, work: Callable[[SceneJob], Outcome]) -> None:
     options = job.options
     before = _bytes_of(options.input)
     outcome = work(job)
-    sizes = f"{size_text(before)} -> {file_size(options.output)}"
+    facts = outcome.facts(before, cvtgs.io.scene_size(options.output))
     stream = sys.stderr if job.to_stream else sys.stdout
     if job.to_stream:
         send_file(options.output)
@@ -204,7 +207,6 @@ def _run_one(job: SceneJob, work: Callable[[SceneJob], Outcome]) -> None:
     for note in outcome.notes:
         say_wrapped(note, file=stream)
     name = STANDARD_OUTPUT if job.to_stream else printable(str(options.output))
-    facts = ", ".join(filter(None, (outcome.counts, sizes, outcome.seconds)))
     if len(name) + len(facts) + 2 > WIDTH:
         say(facts, file=stream)
         say(name, file=stream)
@@ -224,12 +226,13 @@ def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
     """Return a job for every input; raise if two would write the same file."""
     from cvtgs.io.atomic import make_folder
 
-    sources = [Path(path) for pattern in options.paths for path in _expanded(pattern)]
+    sources = expanded(options.paths)
     targets: dict[Path, Path] = {}
     named: dict[str, Path] = {}
     for source in sources:
         name = _output_name(source, options.suffix)
-        before = named.setdefault(_without_case(name), source)
+        ignores_case = sys.platform in ("darwin", "win32")
+        before = named.setdefault(name.lower() if ignores_case else name, source)
         if before is not source:
             raise InvalidArgumentError(
                 f"two scenes must not have the same name in {options.folder}, found "
@@ -252,21 +255,14 @@ def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
     ]
 
 
-def _without_case(name: str) -> str:
-    """Return a text that names of the same file share: macOS and Windows ignore their case."""
-    return name.lower() if sys.platform in ("darwin", "win32") else name
-
-
-def expanded(patterns: Iterable[Path]) -> list[Path]:
-    """Expand patterns that the shell left unexpanded, as those of Windows do."""
-    return [Path(path) for pattern in patterns for path in _matches(str(pattern))]
-
-
-def _expanded(pattern: str) -> list[str]:
-    """Expand a pattern, or a folder of scenes."""
-    if os.path.isdir(pattern):  # noqa: PTH112 (any path)
-        return _in_folder(pattern)
-    return _matches(pattern)
+def expanded(patterns: Iterable[str | Path]) -> list[Path]:
+    """Expand folders of scenes, and patterns that the shell left unexpanded as on Windows."""
+    return [
+        Path(path)
+        for pattern in patterns
+        for found in _matches(str(pattern))
+        for path in _in_folder(found)
+    ]
 
 
 def _matches(pattern: str) -> list[str]:
@@ -294,7 +290,7 @@ def _in_folder(folder: str) -> list[str]:
 
 def check_one_scene(path: str | Path, advice: str = "") -> None:
     """Raise an error with advice if a path is a folder of scenes, and not a scene itself."""
-    found = _in_folder(str(path)) if os.path.isdir(path) else [str(path)]  # noqa: PTH112
+    found = _in_folder(str(path))
     if found != [str(path)]:
         raise InputError(
             f"{path}: must be one scene, found a folder of {counted(len(found), 'scene')}; "

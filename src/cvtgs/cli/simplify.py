@@ -1,7 +1,6 @@
 """``cvtgs simplify``: simplify scenes to a size, quality or time, in memory or in blocks."""
 
 import argparse
-import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -268,11 +267,6 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
     if options.refine is None and options.refine_steps is None:
         return {}
     steps, seconds = options.refine_steps or 0, options.refine or 0.0
-    if steps < 0 or not 0 <= seconds < math.inf:
-        found = steps if steps < 0 else seconds
-        raise InvalidArgumentError(
-            f"--refine and --refine-steps must be at least 0, found {found:g}."
-        )
     return {"refine.steps": str(steps), "refine.seconds": str(seconds)}
 
 
@@ -281,22 +275,20 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
     from cvtgs.outofcore.run import check_config
 
     memory = memory_of(options)
-    names = ("target_psnr", "target_ssim", "time_budget")
-    excluded = [name for name in names if getattr(options, name) is not None]
     if options.scheduler is None and not _needs_blocks(options, memory, config):
         return None
-    if options.memory is None and options.scheduler is None:
-        try:
-            check_config(config)
-        except ConfigError:
-            return None
-        return None if excluded else memory
-    if excluded:
-        words = ", ".join("--" + name.replace("_", "-") for name in excluded)
-        raise InvalidArgumentError(
-            f"{words} cannot be used with blocks: the whole scene is needed at once."
-        )
-    check_config(config)
+    try:
+        for name in ("target_psnr", "target_ssim", "time_budget"):
+            if getattr(options, name) is not None:
+                raise InvalidArgumentError(
+                    f"--{name.replace('_', '-')} cannot be used with blocks: the whole scene is "
+                    f"needed at once."
+                )
+        check_config(config)
+    except (ConfigError, InvalidArgumentError):
+        if options.memory is not None or options.scheduler is not None:
+            raise
+        return None
     return memory
 
 

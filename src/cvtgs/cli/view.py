@@ -9,7 +9,7 @@ import cvtgs
 from cvtgs.cli.display import say
 from cvtgs.cli.jobs import expanded
 from cvtgs.cli.options import PRESET_NAMES, AddParser, add_options, file, ratio
-from cvtgs.errors import InvalidArgumentError, input_errors
+from cvtgs.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -98,9 +98,6 @@ def view(options: argparse.Namespace) -> None:
         cvtgs.io.check_output(options.page, options.overwrite)
     small = expanded(options.small)
     names = [options.input, *small]
-    for path in names:
-        with input_errors(path):
-            path.stat()
     check_viewer()
     scene, *others = (cvtgs.load(path, trust_sizes=options.trust_sizes) for path in names)
     named = {str(path): other for path, other in zip(small, others, strict=True)}
