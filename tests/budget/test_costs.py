@@ -144,9 +144,9 @@ def test_work_of_other_sizes_is_refused(sizes, text):
     ("work", "seconds", "model", "text"),
     [
         (Work(count=9, target=1), "20s", None, "the time must be above 0 and finite, found '20s'"),
-        ("scene.ply", 9.0, None, "work must be a GaussianScene or a Work, found 'scene.ply'."),
-        (None, 9.0, None, "work must be a GaussianScene or a Work, found None."),
-        (Work(count=9, target=1), 9.0, {}, "model must be a CostModel with rates, found {}."),
+        ("scene.ply", 9.0, None, "work must be of type GaussianScene or of type Work, found str."),
+        (None, 9.0, None, "work must be of type GaussianScene or of type Work, found NoneType."),
+        (Work(count=9, target=1), 9.0, {}, "model must be of type CostModel or None, found dict."),
         (Work(count=9, target=1), 9.0, CostModel(rates={}), "with rates, found CostModel(rates={}"),
     ],
 )

@@ -64,8 +64,6 @@ STALE_SECONDS = 90 * 24 * 3600.0
 StageSeconds = Callable[[SimplifyConfig, GaussianScene, int], Mapping[str, float]]
 """Returns the seconds, by stage, of the simplification of a scene to a target count."""
 
-Calibration = Callable[[], CostModel]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
@@ -134,7 +132,7 @@ def cost_model(
     device: str | torch.device = "auto",
     *,
     recalibrate: bool = False,
-    calibration: Calibration | None = None,
+    calibration: Callable[[], CostModel] | None = None,
     folder: str | os.PathLike[str] | None = None,
     listener: ProgressListener = silent,
 ) -> CostModel:

@@ -9,7 +9,8 @@ from typing import Literal, NamedTuple
 
 from cvtgs.budget.calibrate import CANDIDATES, cost_model
 from cvtgs.budget.costs import CostModel, Work
-from cvtgs.cameras import Cameras, checked_cameras
+from cvtgs.cameras import Cameras
+from cvtgs.checks import checked
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import real_number, target_count
 from cvtgs.errors import GoalError, InvalidArgumentError
@@ -113,6 +114,7 @@ def checked_target(psnr: float | None, *, ssim: float | None) -> Target:
     raise InvalidArgumentError("give either psnr or ssim, found both or neither.")
 
 
+@checked
 def find_count(
     scene: SceneLike,
     *,
@@ -164,8 +166,6 @@ def find_count(
         True
     """
     target = checked_target(psnr, ssim=ssim)
-    if simplifier is not None and not isinstance(simplifier, Simplifier):
-        raise InvalidArgumentError(f"simplifier must be a Simplifier, found {shown(simplifier)}.")
     simplifier = simplifier or Simplifier()
     prepared = simplifier.prepare(scene, cameras=cameras)
     total, full = len(prepared.scene), prepared.scene
@@ -214,7 +214,7 @@ def find_count(
 
 def heldout_scorer(full: GaussianScene, cameras: Cameras, *, listener: ProgressListener) -> Scorer:
     """Return a scorer against the full scene over held-out views."""
-    total = len(checked_cameras(cameras))
+    total = len(cameras)
     if total == 0:
         raise InvalidArgumentError("heldout must hold at least one camera, found none.")
     return Scorer(
@@ -289,6 +289,7 @@ class Choice(NamedTuple):
     seconds: float
 
 
+@checked
 def choose_preset(
     work: GaussianScene | Work,
     seconds: float,
@@ -337,11 +338,9 @@ def choose_preset(
         )
     if isinstance(work, GaussianScene):
         work = Work.of(work, target_count(len(work), rho, count=count))
-    elif not isinstance(work, Work):
-        raise InvalidArgumentError(f"work must be a GaussianScene or a Work, found {shown(work)}.")
     elif rho is not None or count is not None:
         raise InvalidArgumentError("rho and count are for a scene only; a Work has its target.")
-    if model is not None and not (isinstance(model, CostModel) and model.rates):
+    if model is not None and not model.rates:
         raise InvalidArgumentError(f"model must be a CostModel with rates, found {shown(model)}.")
     known = cost_model() if model is None else model
     costs = {

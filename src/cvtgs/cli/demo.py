@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cvtgs
-from cvtgs.cli.display import file_size, progress_bars, say, say_table, say_wrapped
+from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped
 from cvtgs.cli.options import AddParser, add_options, count
 from cvtgs.errors import OutputExistsError
+from cvtgs.text import size_text
 
 if TYPE_CHECKING:
     from cvtgs.clock import StageCost
@@ -114,7 +115,11 @@ def _check_folder(folder: Path) -> None:
 def _column(path: Path, count: int, stages: "Sequence[StageCost]") -> dict[str, str]:
     seconds = {f"{cost.stage}, s": f"{cost.seconds:.2f}" for cost in stages}
     total = {"all stages, s": f"{sum(cost.seconds for cost in stages):.2f}"} if stages else {}
-    return {"file": path.name, "Gaussians": f"{count:,}", "size": file_size(path)} | seconds | total
+    return (
+        {"file": path.name, "Gaussians": f"{count:,}", "size": size_text(path.stat().st_size)}
+        | seconds
+        | total
+    )
 
 
 def _print_next_steps(folder: Path) -> None:

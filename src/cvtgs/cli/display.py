@@ -7,10 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-import cvtgs
 from cvtgs.errors import OutputError, reason_of
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.text import columns, counted, padded, printable, size_text
+from cvtgs.text import columns, counted, padded, printable
 
 if TYPE_CHECKING:
     from cvtgs.budget import Found
@@ -77,11 +76,6 @@ def say_table(rows: Sequence[Sequence[str]]) -> None:
     for first, *others in rows:
         cells = (f"{text:>{width}}" for text, width in zip(others, widths[1:], strict=True))
         say(f"  {padded(first, widths[0])}  {'  '.join(cells)}".rstrip())
-
-
-def file_size(path: Path) -> str:
-    """Return the size of a scene, which is a file or a folder, as text."""
-    return size_text(cvtgs.io.scene_size(path))
 
 
 @contextmanager

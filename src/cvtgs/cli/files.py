@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cvtgs
-from cvtgs.cli.display import file_size, say, say_wrapped
+from cvtgs.cli.display import say, say_wrapped
 from cvtgs.cli.jobs import (
     STANDARD_INPUT,
     Outcome,
@@ -29,11 +29,14 @@ from cvtgs.cli.options import (
     read_settings,
 )
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
-from cvtgs.text import counted, printable
+from cvtgs.text import counted, printable, size_text
 
 if TYPE_CHECKING:
+    import pydantic
+
     from cvtgs.analysis import Effect
     from cvtgs.info import SceneInfo
+    from cvtgs.mergenet import Checkpoint
     from cvtgs.scene import GaussianScene
 
 _NUMBERS = {
@@ -171,30 +174,33 @@ def show_info(options: argparse.Namespace) -> None:
     if is_shipped or path.suffix == ".safetensors":
         if options.effects is not None:
             raise InvalidArgumentError("--effects applies to scenes, and cannot be used here.")
-        show_checkpoint(path, as_json=options.json)
+        checkpoint = cvtgs.mergenet.load_checkpoint(path)
+        _show(options, checkpoint.info, checkpoint_rows(checkpoint))
         return
     settings = read_settings(effects=options.effects)
     config = cvtgs.SimplifyConfig.compose(settings=settings)
     with input_file(options.input) as path:
         read = argparse.Namespace(**{**vars(options), "input": path})
         facts = cvtgs.describe(read_scene(read, config), config)
-        is_file = path == options.input
-        file = f"{cvtgs.io.scene_file(path) if is_file else STANDARD_INPUT}, {file_size(path)}"
+        name = cvtgs.io.scene_file(path) if path == options.input else STANDARD_INPUT
+        file = f"{name}, {size_text(cvtgs.io.scene_size(path))}"
+    _show(options, facts, [("file", file), *_rows(facts)])
+
+
+def _show(
+    options: argparse.Namespace, facts: "pydantic.BaseModel", rows: Sequence[tuple[str, str]]
+) -> None:
+    """Print facts as JSON, or as rows of labels and texts."""
     if options.json:
         say(facts.model_dump_json(indent=2))
         return
-    for label, text in [("file", file), *_rows(facts)]:
+    for label, text in rows:
         say(f"{label:<16} {text}")
 
 
-def show_checkpoint(path: Path, *, as_json: bool) -> None:
-    """Print how a checkpoint was trained."""
-    checkpoint = cvtgs.mergenet.load_checkpoint(path)
-    info = checkpoint.info
-    if as_json:
-        say(info.model_dump_json(indent=2))
-        return
-    unknown = "unknown"
+def checkpoint_rows(checkpoint: "Checkpoint") -> list[tuple[str, str]]:
+    """Return how a checkpoint was trained, by label."""
+    info, unknown = checkpoint.info, "unknown"
     rows = [
         ("checkpoint", checkpoint.name),
         ("digest", checkpoint.digest),
@@ -206,15 +212,13 @@ def show_checkpoint(path: Path, *, as_json: bool) -> None:
         ("started from", info.start or ("nothing" if info.config else unknown)),
         ("configuration", info.config or unknown),
     ]
-    rows += [
+    return rows + [
         (
             "validated on" if scene.is_validation else "trained on",
             f"{scene.name}, {scene.count:,}, {scene.sha256 or 'generated'}",
         )
         for scene in info.scenes
     ]
-    for label, text in rows:
-        say(f"{label:<16} {text}")
 
 
 def _rows(facts: "SceneInfo") -> list[tuple[str, str]]:
@@ -338,10 +342,11 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
         phrases += [f"SH bands above degree {options.sh_degree} (--sh-degree)"]
     lost = cvtgs.io.losses(scene, options.output)
     if not (options.quiet or job.is_one_of_many):
-        stream = sys.stderr if job.to_stream else sys.stdout
+        stream, files = sys.stdout, f"files like {options.output.name}"
+        if job.to_stream:
+            stream, files = sys.stderr, f"{options.suffix} files"
         if lost.changed:
-            name = f"files like {options.output.name}"
-            say(f"In {f'{options.suffix} files' if job.to_stream else name}:", file=stream)
+            say(f"In {files}:", file=stream)
         for phrase in lost.changed:
             say_wrapped(phrase, indent=2, file=stream)
         rest = "nothing else" if lost.changed else "nothing"

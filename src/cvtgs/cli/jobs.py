@@ -169,7 +169,7 @@ def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> N
         source, target = job.options.input, job.options.output
         place = f"[{number:>{len(str(len(jobs)))}}/{len(jobs)}] "
         try:
-            bytes_in = _bytes_of(source)
+            bytes_in = cvtgs.io.scene_size(source)
             outcome = work(job)
         except CvtgsError as error:
             failed += 1
@@ -196,30 +196,22 @@ def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> N
 
 def _run_one(job: SceneJob, work: Callable[[SceneJob], Outcome]) -> None:
     options = job.options
-    before = _bytes_of(options.input)
+    before = cvtgs.io.scene_size(options.input)
     outcome = work(job)
     facts = outcome.facts(before, cvtgs.io.scene_size(options.output))
-    stream = sys.stderr if job.to_stream else sys.stdout
+    stream, name = sys.stdout, printable(str(options.output))
     if job.to_stream:
+        stream, name = sys.stderr, STANDARD_OUTPUT
         send_file(options.output)
     if options.quiet:
         return
     for note in outcome.notes:
         say_wrapped(note, file=stream)
-    name = STANDARD_OUTPUT if job.to_stream else printable(str(options.output))
     if len(name) + len(facts) + 2 > WIDTH:
         say(facts, file=stream)
         say(name, file=stream)
     else:
         say(f"{name}: {facts}", file=stream)
-
-
-def _bytes_of(path: Path) -> int:
-    """Return the size of an input, which the output may replace; 0 if it cannot be read."""
-    try:
-        return cvtgs.io.scene_size(path)
-    except OSError:
-        return 0
 
 
 def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:

@@ -201,15 +201,15 @@ def cells(tradeoff: Tradeoff, result: TradeoffResult) -> Mapping[str, str]:
     """Return the table cells of a result as text, by heading."""
     stages = {f"{name}, s": _seconds(result.stage_seconds.get(name)) for name in tradeoff.stages}
     measured = tradeoff.evaluation.lpips_network is not None
-    distance = {"LPIPS": _score(result, "lpips", result.lpips, 4)} if measured else {}
+    distance = {"LPIPS": _score(result, "lpips", 4)} if measured else {}
     return {
         "preset": result.preset,
         "start, s": _seconds(tradeoff.start_seconds),
         **stages,
         "read, write, s": _seconds(tradeoff.rest_seconds(result)),
         "all, s": _seconds(result.seconds),
-        "PSNR, dB": _score(result, "psnr", result.psnr, 2),
-        "SSIM": _score(result, "ssim", result.ssim, 4),
+        "PSNR, dB": _score(result, "psnr", 2),
+        "SSIM": _score(result, "ssim", 4),
         **distance,
         **_against_photograph(tradeoff, result.name),
         "alpha error": "" if result.alpha_error is None else f"{result.alpha_error:.4f}",
@@ -276,7 +276,8 @@ def _seconds(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}"
 
 
-def _score(result: TradeoffResult, metric: str, value: float | None, digits: int) -> str:
+def _score(result: TradeoffResult, metric: str, digits: int) -> str:
+    value: float | None = getattr(result, metric)
     if value is None:
         return ""
     return f"{value:.{digits}f}{MARK if metric in result.fronts else ' '}"

@@ -256,8 +256,7 @@ class ViewerServer:
         Returns:
             HTML that needs no server and fetches nothing.
         """
-        names = [name for name in (FULL, SIMPLIFIED, *self._nodes) if name in self._nodes]
-        html = record_page(self._server, [self._nodes[name] for name in dict.fromkeys(names)])
+        html = record_page(self._server, list(self._nodes.values()))
         self._show()
         return html
 
