@@ -194,9 +194,9 @@ def test_merge_widens_unlike_scenes_and_warns() -> None:
         (lambda: drop_faint(random_scene(2), "a"), "from 0 to 1, found 'a'"),
         (lambda: drop_large(random_scene(2), None), "above 0, found None"),
         (lambda: crop(random_scene(2), None), "regions must be boxes or spheres, found None"),
-        (lambda: move(random_scene(2), None), "motion must be a Motion, found None"),
+        (lambda: move(random_scene(2), None), "motion must be of type Motion, found NoneType"),
         *(
-            (lambda edit=edit: edit(None, 1), "scene must be a GaussianScene, found None")
+            (lambda edit=edit: edit(None, 1), "scene must be of type GaussianScene, found NoneType")
             for edit in (crop, drop_faint, drop_large, move)
         ),
     ],

@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 
 from cvtgs.boxes import Box, Corner, inside, listed
+from cvtgs.checks import checked
 from cvtgs.counts import real_number
 from cvtgs.devices import without_autocast
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn
 from cvtgs.math.parameters import multiply_quats, rotation_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS, rotated_rest
-from cvtgs.scene import NORMALS, GaussianScene, check_scene, checked_scenes, concatenate
+from cvtgs.scene import NORMALS, GaussianScene, checked_scenes, concatenate
 from cvtgs.tags import TWO_SCALES
 from cvtgs.text import shown
 
@@ -141,6 +142,7 @@ def _cos_sin(degrees: float) -> tuple[float, float]:
     return math.cos(radians), math.sin(radians)
 
 
+@checked
 def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -> GaussianScene:
     """Keep the Gaussians whose centres lie in a region.
 
@@ -161,7 +163,6 @@ def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -
         >>> len(crop(scene, [Sphere(center=(0.0, 0.0, 0.0), radius=1e6)]))
         100
     """
-    check_scene(scene)
     regions = listed(regions, Box | Sphere, required="regions must be boxes or spheres")
     if not regions:
         raise InvalidArgumentError("crop needs at least one box or sphere, found none.")
@@ -173,6 +174,7 @@ def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -
     return _kept(scene, keep)
 
 
+@checked
 def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
     """Drop the Gaussians below an opacity.
 
@@ -192,7 +194,6 @@ def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
         >>> bool((drop_faint(scene, 0.5).opacities >= 0.5).all())
         True
     """
-    check_scene(scene)
     if not 0 <= real_number(least) <= 1:
         raise InvalidArgumentError(
             f"the lowest opacity to keep must be from 0 to 1, found {shown(least)}."
@@ -201,6 +202,7 @@ def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
     return _kept(scene, ~(torch.sigmoid(scene.logit_opacities.double()) < least))
 
 
+@checked
 def drop_large(scene: GaussianScene, largest: float) -> GaussianScene:
     """Drop the Gaussians above a size.
 
@@ -220,7 +222,6 @@ def drop_large(scene: GaussianScene, largest: float) -> GaussianScene:
         >>> len(drop_large(scene, 1e6))
         100
     """
-    check_scene(scene)
     if not real_number(largest) > 0:
         raise InvalidArgumentError(
             f"the largest size to keep must be above 0, found {shown(largest)}."
@@ -233,6 +234,7 @@ def _kept(scene: GaussianScene, keep: Tensor) -> GaussianScene:
 
 
 @without_autocast()
+@checked
 def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
     """Rotate, scale and translate a scene; view-dependent colours and normals rotate with it.
 
@@ -254,9 +256,6 @@ def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
         >>> (move(one, Motion(shift=(1.0, 0.0, 0.0))).means - one.means).tolist()
         [[1.0, 0.0, 0.0]]
     """
-    check_scene(scene)
-    if not isinstance(motion, Motion):
-        raise InvalidArgumentError(f"motion must be a Motion, found {shown(motion)}.")
     means, changes, extras = scene.means.double(), {}, scene.extras
     quat = torch.tensor([motion.quat], dtype=torch.float64, device=scene.device)
     if bool((quat[0, 1:] != 0).any()):

@@ -6,13 +6,13 @@ from torch import Tensor
 
 from cvtgs.analysis import EffectPlan, analyze
 from cvtgs.analysis.analyze import select_columns
+from cvtgs.checks import checked
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
-from cvtgs.errors import InvalidArgumentError, InvalidSceneError
+from cvtgs.errors import InvalidSceneError
 from cvtgs.math import parameters
 from cvtgs.math.segments import running_sums
 from cvtgs.scene import SceneLike, as_scene
-from cvtgs.text import shown
 from cvtgs.validity import any_row, invalid_rows
 
 FAINT = 0.1
@@ -69,6 +69,7 @@ HEAVIEST = (0.001, 0.01, 0.1, 0.5)
 
 
 @torch.no_grad()
+@checked
 def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInfo:
     """Collect facts about a scene.
 
@@ -94,9 +95,7 @@ def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInf
     if len(scene) == int(bad.sum()):
         raise InvalidSceneError(f"none of the {len(scene)} Gaussians is valid.")
     valid = scene.select(~bad) if invalid else scene
-    config = SimplifyConfig() if config is None else config
-    if not isinstance(config, SimplifyConfig):
-        raise InvalidArgumentError(f"config must be a SimplifyConfig, found {shown(config)}.")
+    config = config or SimplifyConfig()
     analysis = analyze(select_columns(valid, config.effects), config)
     frame, opacities = analysis.frame, analysis.opacities
     masses = analysis.areas * opacities

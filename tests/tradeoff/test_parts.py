@@ -298,16 +298,16 @@ def test_presets_and_ratios_are_checked():
 
 
 def test_the_size_of_a_folder_is_that_of_its_scene(tmp_path, monkeypatch):
-    def run(source, tasks, folder, **options):
-        path = folder / tasks[0].file_name
+    def run(source, task, folder, **options):
+        path = folder / task.file_name
         cvtgs.save(cvtgs.load(source), path)
         cost = ProcessCost(
             wall_seconds=1.0, user_seconds=1.0, peak_memory_bytes=0, output="", errors=""
         )
-        yield Run(task=tasks[0], path=path, cost=cost, report=MADE[0].report)
+        return Run(task=task, path=path, cost=cost, report=MADE[0].report)
 
     module = import_module("cvtgs.tradeoff.measure")
-    monkeypatch.setattr(module, "run_tasks", run)
+    monkeypatch.setattr(module, "run_task", run)
     monkeypatch.setattr(module, "start_seconds", lambda: 0.0)
     file = tmp_path / "point_cloud.ply"
     cvtgs.save(cvtgs.synthetic.scene("object", 200, sh_degree=0, seed=0), file)

@@ -267,9 +267,11 @@ def _matches(pattern: str) -> list[str]:
 
 
 def _in_folder(folder: str) -> list[str]:
-    """Return the scenes in a folder, or the folder itself if it is a scene."""
+    """Return the scenes in a folder, or the path itself if it is a scene or no folder."""
     from cvtgs.io.formats import READABLE_SUFFIXES
 
+    if not os.path.isdir(folder):  # noqa: PTH112 (any path)
+        return [folder]
     try:
         cvtgs.io.scene_file(folder)
     except InputError:

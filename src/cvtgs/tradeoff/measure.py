@@ -18,12 +18,13 @@ from cvtgs.errors import RunError, warn
 from cvtgs.evaluation import Comparison, EvaluationSettings, compare
 from cvtgs.evaluation.scorer import mean_of
 from cvtgs.io import load, scene_size
-from cvtgs.progress import ProgressListener, silent
+from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.scene import GaussianScene
 from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult, with_fronts
-from cvtgs.tradeoff.runs import Run, run_tasks, start_seconds, tasks_of
+from cvtgs.tradeoff.runs import Run, pass_warnings_on, run_task, start_seconds, tasks_of
 from cvtgs.views import automatic_views, find_own_cameras
 
+STAGE = "simplify"
 RATIOS = (0.1, 0.01, 0.001)
 
 CameraChoice = Callable[[GaussianScene], Cameras]
@@ -113,19 +114,20 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
     with kept or TemporaryDirectory(prefix="cvtgs-") as name:
         place = Path(name)
         start = start_seconds()
-        done = list(
-            run_tasks(
-                source,
-                tasks,
-                place,
-                training=own.source if own is not None and held_out else None,
-                device=device,
-                trust_sizes=trust_sizes,
-                listener=listener,
-            )
-        )
-        runs = [one for one in done if isinstance(one, Run)]
-        failures = tuple(one for one in done if isinstance(one, Failure))
+        training = own.source if own is not None and held_out else None
+        runs, failures, warned = list[Run](), list[Failure](), set[str]()
+        for done, task in enumerate(tasks):
+            listener(ProgressEvent(stage=STAGE, done=done, total=len(tasks), note=task.name))
+            try:
+                run = run_task(
+                    source, task, place, training=training, device=device, trust_sizes=trust_sizes
+                )
+            except RunError as error:
+                failures.append(Failure(name=task.name, reason=str(error)))
+            else:
+                runs.append(run)
+                pass_warnings_on(run.cost.errors, warned)
+        listener(ProgressEvent(stage=STAGE, done=len(tasks), total=len(tasks)))
         if failures and not runs:
             raise RunError(f"every run failed; {failures[0].name}: {failures[0].reason}")
         for failure in failures:
@@ -169,7 +171,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         f"Python {platform.python_version()}, torch {torch.__version__}",
         evaluation=comparison.evaluation,
         results=tuple(with_fronts(results)),
-        failures=failures,
+        failures=tuple(failures),
         held_out=held_out,
     )
     return Measured(tradeoff, comparison)

@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,11 +11,8 @@ from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.config.simplify import unknown_preset
 from cvtgs.counts import target_count, written
 from cvtgs.errors import InvalidArgumentError, RunError, warn
-from cvtgs.progress import ProgressEvent, ProgressListener
 from cvtgs.report import SimplifyReport
-from cvtgs.tradeoff.results import Failure
 
-STAGE = "simplify"
 WARNING = "cvtgs: warning: "
 
 START = "import cvtgs.cli.main, cvtgs.config, cvtgs.io, cvtgs.mergenet, cvtgs.simplifier"
@@ -105,36 +102,6 @@ def tasks_of(presets: Sequence[str] | None, ratios: Sequence[float]) -> tuple[Ta
     return tasks
 
 
-def run_tasks(
-    source: str | os.PathLike[str],
-    tasks: Sequence[Task],
-    folder: Path,
-    *,
-    training: Path | None,
-    device: str,
-    trust_sizes: bool,
-    listener: ProgressListener,
-) -> Iterator[Run | Failure]:
-    """Run every task in its own process, one after another.
-
-    ``training`` has the cameras to whose training split presets that use images are fitted; without
-    it, these presets find their cameras themselves.
-    """
-    warned: set[str] = set()
-    for done, task in enumerate(tasks):
-        listener(ProgressEvent(stage=STAGE, done=done, total=len(tasks), note=task.name))
-        try:
-            run = run_task(
-                source, task, folder, training=training, device=device, trust_sizes=trust_sizes
-            )
-        except RunError as error:
-            yield Failure(name=task.name, reason=str(error))
-        else:
-            pass_warnings_on(run.cost.errors, warned)
-            yield run
-    listener(ProgressEvent(stage=STAGE, done=len(tasks), total=len(tasks)))
-
-
 def run_task(
     source: str | os.PathLike[str],
     task: Task,
@@ -144,7 +111,11 @@ def run_task(
     device: str = "auto",
     trust_sizes: bool = False,
 ) -> Run:
-    """Run one task by ``cvtgs simplify`` in its own process."""
+    """Run one task by ``cvtgs simplify`` in its own process.
+
+    ``training`` has the cameras to whose training split presets that use images are fitted; without
+    it, these presets find their cameras themselves.
+    """
     path, report = folder / task.file_name, folder / f".{task.file_name}.json"
     words = ["--rho", repr(task.rho), "--preset", task.preset, "--device", device]
     words += ["--report", str(report), "--overwrite", "--quiet"]
