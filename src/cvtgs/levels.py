@@ -122,14 +122,6 @@ class LevelsIndex(Record):
     views: int = 0
     levels: tuple[LevelEntry, ...]
 
-    def to_json(self) -> str:
-        """Return the index as indented JSON.
-
-        Returns:
-            JSON text that ends with a line break.
-        """
-        return self.model_dump_json(indent=2) + "\n"
-
 
 def level_names(rhos: Sequence[float], suffix: str = ".ply") -> tuple[str, ...]:
     """Return the file names of levels, one per ratio."""
@@ -220,10 +212,7 @@ def write_levels(
 def add_scores(index: LevelsIndex, folder: Path, evaluation: Evaluation) -> LevelsIndex:
     """Add scores to the index of levels, also on disk."""
     scores = {one.name: one for one in evaluation.scenes}
-    levels = tuple(
-        level.with_scores(scores[level.file]) if level.file in scores else level
-        for level in index.levels
-    )
+    levels = tuple(level.with_scores(scores[level.file]) for level in index.levels)
     index = index.model_copy(update={"levels": levels, "views": len(evaluation.views)})
     _write_index(index, folder, overwrite=True)
     return index

@@ -162,14 +162,6 @@ class SimplifyReport(CellStatistics):
             f"{self.device})"
         )
 
-    def to_json(self) -> str:
-        """Return the report as indented JSON.
-
-        Returns:
-            JSON text that ends with a line break.
-        """
-        return self.model_dump_json(indent=2) + "\n"
-
 
 class Simplified(NamedTuple):
     """A simplified scene and its report.

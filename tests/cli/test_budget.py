@@ -77,8 +77,6 @@ def test_some_options_exclude_each_other(capsys):
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--target-psnr", "99"], "the PSNR to reach must be above 0 and at most 60 dB, found"),
-        (["--target-ssim", "30"], "the SSIM to reach must be above 0 and below 1, found 30.0."),
         (["--rho", "0.1", "--recalibrate"], "--recalibrate needs --time-budget."),
         (["--rho", "0.1", "--shipped-rates"], "--shipped-rates needs --time-budget."),
         (

@@ -174,7 +174,7 @@ def cost_model(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_output(path, overwrite=True) as file:
-            file.write(record.model_dump_json(indent=2).encode())
+            file.write(record.to_json().encode())
     except (OSError, OutputError):
         pass  # the next process measures again
     return model

@@ -48,12 +48,8 @@ def has_target(options: argparse.Namespace) -> bool:
 
 def check_goals(options: argparse.Namespace) -> None:
     """Check the goals, and raise for options that exclude them or need them."""
-    if has_target(options):
-        from cvtgs.budget.count import checked_target
-
-        if options.keep is not None:
-            raise InvalidArgumentError("--keep needs --rho, --count or --max-count.")
-        checked_target(options.target_psnr, ssim=options.target_ssim)
+    if has_target(options) and options.keep is not None:
+        raise InvalidArgumentError("--keep needs --rho, --count or --max-count.")
     if options.time_budget is None:
         for option in ("recalibrate", "shipped-rates"):
             if getattr(options, option.replace("-", "_")):

@@ -352,20 +352,18 @@ def check_written_files(options: argparse.Namespace) -> None:
 
     Only OUT may replace IN, which is read before OUT is written.
     """
-    read = {"IN": cvtgs.io.scene_file(options.input)} | {
+    taken = {
         f"--{name}": Path(value)
         for name in ("config", "cameras", "keep", "ckpt")
         if (value := getattr(options, name)) not in (None, "auto", "none")
     }
-    written = {"OUT": options.output, "--report": options.report}
-    for name, path in written.items():
-        others = {key: other for key, other in read.items() if (name, key) != ("OUT", "IN")}
-        others |= {"OUT": options.output} if name == "--report" else {}
-        for other, taken in others.items():
-            if path is not None and is_same_file(path, taken):
+    for name, path in (("OUT", options.output), ("--report", options.report)):
+        for other, file in taken.items():
+            if path is not None and is_same_file(path, file):
                 raise InvalidArgumentError(
                     f"{name} and {other} must be different files, found {path} for both."
                 )
+        taken |= {"IN": cvtgs.io.scene_file(options.input), "OUT": options.output}
 
 
 def is_same_file(path: Path, other: Path) -> bool:

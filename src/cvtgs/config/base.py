@@ -19,6 +19,14 @@ class Record(pydantic.BaseModel):
         frozen=True, extra="forbid", ser_json_inf_nan="strings"
     )
 
+    def to_json(self) -> str:
+        """Return everything as indented JSON; infinity becomes the string ``Infinity``.
+
+        Returns:
+            JSON text that ends with a line break.
+        """
+        return self.model_dump_json(indent=2) + "\n"
+
 
 class Section(pydantic.BaseModel):
     """Base of settings: frozen; unknown keys and non-finite numbers are errors."""

@@ -130,14 +130,6 @@ class Evaluation(Record):
             return f"LPIPS was not measured: {self.lpips_note}."
         return ""
 
-    def to_json(self) -> str:
-        """Return the evaluation as indented JSON; infinity becomes the string ``Infinity``.
-
-        Returns:
-            JSON text that ends with a line break.
-        """
-        return self.model_dump_json(indent=2) + "\n"
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationSettings:

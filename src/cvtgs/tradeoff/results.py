@@ -117,14 +117,6 @@ class Tradeoff(Record):
         """
         return max(0.0, result.seconds - self.start_seconds - sum(result.stage_seconds.values()))
 
-    def to_json(self) -> str:
-        """Return everything as indented JSON; infinity becomes the string ``Infinity``.
-
-        Returns:
-            JSON text that ends with a line break.
-        """
-        return self.model_dump_json(indent=2) + "\n"
-
     def to_csv(self) -> str:
         """Return one line per run, with seconds per stage.
 
