@@ -60,31 +60,6 @@ class LevelEntry(Record):
     alpha_error: float | None = None
     alpha_bias: float | None = None
 
-    @classmethod
-    def of(cls, level: Level, rho: float, path: Path) -> Self:
-        """Describe a level by its file, which may hold rounded values.
-
-        Args:
-            level: The level.
-            rho: Ratio that was requested.
-            path: File of the level.
-
-        Returns:
-            The entry, without scores.
-        """
-        stored = load(path, axes=SCENE_AXES, trust_sizes=True)
-        lowest, highest = torch.aminmax(stored.means, dim=0)
-        return cls(
-            file=path.name,
-            rho=rho,
-            count=len(stored),
-            bytes=path.stat().st_size,
-            geometric_error=level.geometric_error,
-            box_min=tuple(lowest.tolist()),
-            box_max=tuple(highest.tolist()),
-            seconds=level.report.seconds,
-        )
-
     def with_scores(self, scores: SceneScores) -> Self:
         """Return the entry with scores.
 
@@ -199,7 +174,7 @@ def write_levels(
     entries = []
     for level, rho, name in zip(levels, rhos, names, strict=True):
         save(level.scene, place / name, overwrite=overwrite, axes=axes)
-        entries.append(LevelEntry.of(level, rho, place / name))
+        entries.append(_entry(level, rho, place / name))
     index = LevelsIndex(
         source=printable(source),
         source_count=levels[0].report.input_count,
@@ -207,6 +182,22 @@ def write_levels(
     )
     _write_index(index, place, overwrite=overwrite)
     return index
+
+
+def _entry(level: Level, rho: float, path: Path) -> LevelEntry:
+    """Describe a level by its file, which may hold rounded values."""
+    stored = load(path, axes=SCENE_AXES, trust_sizes=True)
+    lowest, highest = torch.aminmax(stored.means, dim=0)
+    return LevelEntry(
+        file=path.name,
+        rho=rho,
+        count=len(stored),
+        bytes=path.stat().st_size,
+        geometric_error=level.geometric_error,
+        box_min=tuple(lowest.tolist()),
+        box_max=tuple(highest.tolist()),
+        seconds=level.report.seconds,
+    )
 
 
 def add_scores(index: LevelsIndex, folder: Path, evaluation: Evaluation) -> LevelsIndex:

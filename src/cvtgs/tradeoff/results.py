@@ -133,21 +133,11 @@ class Tradeoff(Record):
     def _row(self, result: TradeoffResult) -> dict[str, str | int | float | None]:
         seconds = {f"{name}_seconds": result.stage_seconds.get(name) for name in self.stages}
         return {
-            "preset": result.preset,
-            "rho": result.rho,
-            "count": result.count,
-            "bytes": result.bytes,
-            "seconds": result.seconds,
+            **result.model_dump(exclude={"name", "report"}),
+            "fronts": " ".join(result.fronts),
             "start_seconds": self.start_seconds,
             **seconds,
             "read_write_seconds": self.rest_seconds(result),
-            "peak_memory_bytes": result.peak_memory_bytes,
-            "psnr": result.psnr,
-            "ssim": result.ssim,
-            "lpips": result.lpips,
-            "alpha_error": result.alpha_error,
-            "alpha_bias": result.alpha_bias,
-            "fronts": " ".join(result.fronts),
         }
 
 
