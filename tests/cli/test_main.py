@@ -134,6 +134,10 @@ def test_without_a_command_the_help_is_printed(capsys):
             "argument --report: must be a file, found the folder 'd/'\n",
         ),
         (["info", "a.ply", "b.ply"], "cvtgs info: error: unrecognized arguments: b.ply\n"),
+        (
+            ["levels", "a.ply", "-o", "l", "--rho", "0.1", "0.01"],
+            "unrecognized arguments: 0.01; separate ratios by commas: --rho 0.1,0.01\n",
+        ),
     ],
 )
 def test_mistyped_words_get_a_suggestion(words, end, capsys):

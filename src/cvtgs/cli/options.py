@@ -215,8 +215,15 @@ class CommandParser(argparse.ArgumentParser):
             rest = [word for word in rest if word != "-" and word.startswith("-")]
             self.check(self, known)
         if rest and self._subparsers is None:
-            self.error(f"unrecognized arguments: {' '.join(rest)}")
+            self.error(f"unrecognized arguments: {' '.join(rest)}{self._ratios_hint(rest)}")
         return known, rest
+
+    def _ratios_hint(self, rest: Sequence[str]) -> str:
+        """Return a hint if ratios that are left over belong into the list of ``--rho``."""
+        rho = self._option_string_actions.get("--rho")
+        takes_list = rho is not None and rho.metavar == "R,R"
+        are_ratios = all(re.fullmatch(r"[\d.]+%?,?", word) for word in rest)
+        return "; separate ratios by commas: --rho 0.1,0.01" if takes_list and are_ratios else ""
 
     def _print_message(self, message: str, file: Any = None) -> None:
         """Print with :func:`say`; argparse has no public hook for this."""
