@@ -24,7 +24,7 @@ def test_a_scene_shows_an_image_and_its_facts():
     text = scene.with_tensors(extras={"<label>": torch.arange(2000)})._repr_html_()
     assert image_of(text).shape == (240, 320, 3)
     assert image_of(text).max() > 100
-    for fact in (">2,000<", ">1<", ">0.2 MB, float32<", ">cpu<", ">&lt;label&gt;<"):
+    for fact in (">2,000<", ">1<", ">200.0 kB, float32<", ">cpu<", ">&lt;label&gt;<"):
         assert fact in text
 
 

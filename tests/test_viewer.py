@@ -70,7 +70,7 @@ def test_the_page_starts_with_the_simplified_scene(page: Any) -> None:
     assert page.server.address == "http://127.0.0.1:8080"
     assert page.stand.scene.up == "-y"
     assert visible(page) == [50]
-    assert control(page, FACTS).content.startswith("50 of 500 Gaussians, 0.0052 MB as .ply, ")
+    assert control(page, FACTS).content.startswith("50 of 500 Gaussians, 5.2 kB as .ply, ")
     assert control(page, "show").options == ("simplified", "full scene", "other.ply")
 
 
@@ -120,7 +120,7 @@ def test_presets_and_scenes_can_be_switched(page: Any) -> None:
     until(lambda: control(page, FACTS).content.endswith("with fast"))
     control(page, "show").value = "full scene"
     assert visible(page) == [500]
-    assert control(page, FACTS).content == "500 of 500 Gaussians, 0.052 MB as .ply"
+    assert control(page, FACTS).content == "500 of 500 Gaussians, 52.0 kB as .ply"
     control(page, "show").value = "other.ply"
     assert visible(page) == [7]
 

@@ -256,7 +256,8 @@ class ViewerServer:
         Returns:
             HTML that needs no server and fetches nothing.
         """
-        html = record_page(self._server, list(self._nodes.values()))
+        names = [name for name in (FULL, SIMPLIFIED, *self._nodes) if name in self._nodes]
+        html = record_page(self._server, [self._nodes[name] for name in dict.fromkeys(names)])
         self._show()
         return html
 
