@@ -15,8 +15,7 @@ from cvtgs.math.segments import running_sums
 from cvtgs.scene import SceneLike, as_scene
 from cvtgs.validity import any_row, invalid_rows
 
-FAINT = 0.1
-"""Opacities below this are counted as faint: the filter of CVT-GS would drop them."""
+FAINT = 0.1  # opacities below this are counted as faint: the filter of CVT-GS would drop them
 
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 

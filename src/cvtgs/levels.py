@@ -21,8 +21,7 @@ from cvtgs.text import printable
 
 __all__ = ["LevelEntry", "LevelsIndex", "write_levels"]
 
-INDEX_NAME = "levels.json"
-"""Name of the index file, in the folder of the levels."""
+INDEX_NAME = "levels.json"  # name of the index file, in the folder of the levels
 
 
 class LevelEntry(Record):

@@ -34,8 +34,7 @@ _LABEL_POSITIONS = (
 )
 """Label positions: offsets to the right and up of the point, in typographic points; alignments."""
 
-Extents = tuple[float, float, float, float]
-"""Left, lower, right and upper edges in pixels."""
+Extents = tuple[float, float, float, float]  # left, lower, right and upper edges in pixels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -24,11 +24,8 @@ else:
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-WAKE_SECONDS = 0.5
-"""Longest wait for a result at once: on Windows, Ctrl-C does not end a wait."""
-
-MOST_ON_WINDOWS = 61
-"""Largest number of processes that a pool of Python has on Windows."""
+WAKE_SECONDS = 0.5  # longest wait for a result at once: on Windows, Ctrl-C does not end a wait
+MOST_ON_WINDOWS = 61  # largest number of processes that a pool of Python has on Windows
 
 
 class Workers(Protocol):

@@ -40,8 +40,7 @@ MOST_REPEATS = 3
 MOST_CPU_SECONDS = 15.0
 """CPU seconds after which nothing is repeated, and only mandatory trials are measured."""
 
-LEAST_MEASURED = 3
-"""Number of trials that are measured however long they take."""
+LEAST_MEASURED = 3  # number of trials that are measured however long they take
 
 MOST_START_SECONDS = 1.0
 """Cap on loading time: anything beyond it was compilation, which happens once per installation."""

@@ -36,20 +36,11 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
 }
 """Features of each stage; its seconds are linear in their amounts."""
 
-OTHER_FEATURES = ("once", "in", "out")
-"""Features of all other stages."""
-
-SHARE_OF_A_STEP = 0.2
-"""Cost of rendering an image without gradients, as a share of a step."""
-
-STEPS_OF_A_BATCH = 8.0
-"""Cost of generating one batch of views of any size, in steps."""
-
-LEAST_SECONDS = 2e-3
-"""Floor of measured seconds in the relative errors of a fit."""
-
-PRIOR_WEIGHT = 0.3
-"""Weight of each prior rate in a fit, in measurements."""
+OTHER_FEATURES = ("once", "in", "out")  # features of all other stages
+SHARE_OF_A_STEP = 0.2  # cost of rendering an image without gradients, as a share of a step
+STEPS_OF_A_BATCH = 8.0  # cost of generating one batch of views of any size, in steps
+LEAST_SECONDS = 2e-3  # floor of measured seconds in the relative errors of a fit
+PRIOR_WEIGHT = 0.3  # weight of each prior rate in a fit, in measurements
 
 
 COLORS = tuple(3 * (degree + 1) ** 2 for degree in range(4))

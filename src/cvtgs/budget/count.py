@@ -30,13 +30,11 @@ HELDOUT_SEED = 307
 VIEWS, WIDTH, HEIGHT = 8, 640, 480
 """Number and size of views, as in ``cvtgs evaluate``: scores depend on the size of images."""
 
-MOST_SHARE = 0.9
-"""Largest share of Gaussians to try: above it, the full scene is hardly larger."""
+MOST_SHARE = 0.9  # largest share of Gaussians to try: above it, the full scene is hardly larger
 
 MOST_TRIES = 16
 
-CLOSE = 1.03
-"""The search ends when a sufficient and an insufficient count are within this factor."""
+CLOSE = 1.03  # the search ends when a sufficient and an insufficient count are within this factor
 
 _FIRST_SHARE, _STEP, _SHORTEST = 0.1, 8.0, 0.15
 

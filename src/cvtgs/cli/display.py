@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from cvtgs.config import SimplifyConfig
     from cvtgs.report import SimplifyReport
 
-WIDTH = 80
-"""Maximum columns of a line of output."""
+WIDTH = 80  # maximum columns of a line of output
 
 TIE = "\N{NO-BREAK SPACE}"
 """A space at which lines do not break; it is printed as an ordinary space."""

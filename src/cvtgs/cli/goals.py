@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from cvtgs.scene import GaussianScene
     from cvtgs.simplifier import Simplifier
 
-STARTED = time.perf_counter()
-"""Approximate start of this process, from which a time budget counts."""
+STARTED = time.perf_counter()  # approximate start of this process, from which a time budget counts
 
 UNITS = {"s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 

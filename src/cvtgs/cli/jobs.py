@@ -29,8 +29,7 @@ from cvtgs.errors import (
 )
 from cvtgs.text import counted, printable, shortened, shown, size_text
 
-STREAM = "-"
-"""The path that stands for standard input or output."""
+STREAM = "-"  # the path that stands for standard input or output
 
 STANDARD_INPUT, STANDARD_OUTPUT = "standard input", "standard output"
 _OTHER_FORMATS = "save a scene in another format as a file, whose suffix gives the format"

@@ -29,7 +29,7 @@ except (ImportError, OSError) as error:
         f"{how_to_install('numba')}, or use backend='torch'."
     ) from error
 
-Array = NDArray[Any]  # Floats, all of one dtype, which numba infers
+Array = NDArray[Any]  # floats, all of one dtype, which numba infers
 Ints = NDArray[Any]  # integers
 
 PixelBox = tuple[int, int, int, int]

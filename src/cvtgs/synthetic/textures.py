@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cvtgs.synthetic.surfaces import FACE_STEP
 
-Color = tuple[float, float, float]  # Red, green, blue in [0, 1]
+Color = tuple[float, float, float]  # red, green, blue in [0, 1]
 
 Texture = Callable[[Float[Tensor, "n 2"]], Float[Tensor, "n 3"]]
 """Function from texture coordinates to colours."""

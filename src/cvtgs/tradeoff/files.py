@@ -20,12 +20,10 @@ from cvtgs.tradeoff.results import Tradeoff, TradeoffResult
 CSV, JSON, PLOT = "tradeoff.csv", "tradeoff.json", "tradeoff.png"
 STAGE = "write pages"
 
-WIDTH, HEIGHT = 1200, 560
-"""Pixels of the plot."""
+WIDTH, HEIGHT = 1200, 560  # pixels of the plot
 
 DIGITS = ((1, 2, 3, 5, 7), (1, 2, 5), (1,))
-MOST_TICKS = 12
-"""Largest number of tick labels that do not overlap."""
+MOST_TICKS = 12  # largest number of tick labels that do not overlap
 
 MARK = "*"
 MARK_MEANS = "* no other preset is as good in less time with the same number of Gaussians"

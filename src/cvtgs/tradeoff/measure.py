@@ -27,8 +27,7 @@ from cvtgs.views import automatic_views, find_own_cameras
 STAGE = "simplify"
 RATIOS = (0.1, 0.01, 0.001)
 
-CameraChoice = Callable[[GaussianScene], Cameras]
-"""Function that returns the views of a scene."""
+CameraChoice = Callable[[GaussianScene], Cameras]  # function that returns the views of a scene
 
 PhotographChoice = Callable[[Cameras], Float[Tensor, "c h w 3"]]
 """Function that returns the photograph of every camera, at the size of the cameras."""

@@ -23,11 +23,8 @@ __all__ = ["SceneViewer", "ShownScene"]
 
 FULL, SIMPLIFIED = "full scene", "simplified"
 
-WARM_RATIO = 0.5
-"""Largest ratio to prepare for: above an eighth, pairs of single Gaussians merge."""
-
-SCORE_SIDE = 480
-"""Longer side of scored images, pixels."""
+WARM_RATIO = 0.5  # largest ratio to prepare for: above an eighth, pairs of single Gaussians merge
+SCORE_SIDE = 480  # longer side of scored images, pixels
 
 
 class ShownScene(NamedTuple):

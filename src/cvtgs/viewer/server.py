@@ -38,11 +38,8 @@ __all__ = ["ViewerServer", "check_viewer", "scene_page"]
 
 Point = tuple[float, float, float]
 
-_FLIP_SECONDS = 2.0
-"""Seconds for which a standalone page shows each scene."""
-
-_ANY_PORT = 8999
-"""First port tried for the temporary server that records a standalone page."""
+_FLIP_SECONDS = 2.0  # seconds for which a standalone page shows each scene
+_ANY_PORT = 8999  # first port tried for the temporary server that records a standalone page
 
 _ABOVE = 0.85
 """Height of labels in the initial view, as a share of half the image; all scenes share it."""
@@ -55,8 +52,7 @@ _MARKUP = re.compile(r"[!-/:-@\[-`{-~]")
 
 _ADVICE = "free some, or choose another preset"
 
-_GIVE_UP = 0.5
-"""Seconds between checks whether the server was closed."""
+_GIVE_UP = 0.5  # seconds between checks whether the server was closed
 
 
 def scene_page(scenes: Mapping[str, GaussianScene]) -> str:
