@@ -1,7 +1,5 @@
 """Ambient visibility: how freely a Gaussian can be seen from nearby, computed without rendering."""
 
-from functools import partial
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -83,9 +81,10 @@ def visibility_grid(sums: Int[Tensor, "voxels"]) -> Float[Tensor, "voxels"]:
     for axis in range(3):  # the transmittance of the next voxels, averaged over six directions
         across = 1 if axis == 0 else 0  # slabs along another axis, to bound memory
         slabs = zip(grid.split(SLAB, across), visible.split(SLAB, across), strict=True)
-        # Slabs share no voxel, so threads may fill them in any order.
-        for _ in in_threads(partial(_add_transmittance, axis), slabs, sums.device):
-            pass
+        for slab, target in slabs:
+            through = torch.exp(-_windows(slab, axis))
+            target.add_(through.narrow(axis, 0, size))
+            target.add_(through.narrow(axis, REACH + 1, size))
     return torch.nn.functional.pad(visible.div_(6).flatten(), (0, 1), value=1.0)
 
 
@@ -111,14 +110,6 @@ def _voxels_of(
     inside = ((voxels >= 0) & (voxels < size)).all(dim=1)
     i, j, k = voxels.unbind(1)
     return torch.where(inside, (i * size + j) * size + k, size**3), shrinkage
-
-
-def _add_transmittance(axis: int, slabs: tuple[Tensor, Tensor]) -> None:
-    """Add the transmittance of the next voxels in both directions to the second slab."""
-    (depths, target), size = slabs, 2 * HALF_GRID
-    through = torch.exp(-_windows(depths, axis))
-    target.add_(through.narrow(axis, 0, size))
-    target.add_(through.narrow(axis, REACH + 1, size))
 
 
 def _windows(slab: Float[Tensor, "a b c"], axis: int) -> Float[Tensor, "d e f"]:

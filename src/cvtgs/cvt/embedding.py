@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.checks import checked
-from cvtgs.devices import in_chunks
+from cvtgs.devices import row_chunks
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import SH_C0
 
@@ -46,16 +46,13 @@ def embed(
     """
     colored = sh0 is not None and color > 0.0
     points = means.new_empty(len(means), 6 if colored else 3)
-
-    def embed_part(part: slice) -> None:
+    for part in row_chunks(len(means), CHUNK, means.device):
         local = means[part]
         position = frame.contract(local, contraction) if contraction else frame.normalize(local)
         points[part, :3] = position.clamp_(-FARTHEST, FARTHEST)
         if sh0 is not None and colored:
             rgb = (SH_C0 * sh0[part, 0].double()).clamp(-0.5, 0.5 + COLOR_HEADROOM)
             points[part, 3:] = color * rgb
-
-    in_chunks(embed_part, len(means), CHUNK, means.device)
     return points
 
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.devices import in_chunks, in_threads
+from cvtgs.devices import in_chunks
 
 RADIUS_QUANTILE = 0.7  # the share of points within the radius of a frame
 CHUNK = 1 << 16  # points per chunk, to bound memory
@@ -97,8 +97,7 @@ def robust_frame(points: Float[Tensor, "n 3"]) -> RobustFrame:
         >>> frame.center.tolist(), frame.radius
         ([1.0, 0.0, 0.0], 1.0)
     """
-    medians = in_threads(torch.median, points.unbind(1), points.device)
-    center = torch.stack(list(medians)).double()
+    center = torch.stack(list(map(torch.median, points.unbind(1)))).double()
     distances = RobustFrame(center=center, radius=1.0).distances(points)
     radius = _radius(distances) or _radius(distances[distances > 0.0]) or 1.0
     return RobustFrame(center=center, radius=radius)
@@ -130,13 +129,10 @@ def morton_order(
     """
     low = points.amin(dim=0)
     side = (points.amax(dim=0) - low).amax().clamp_min(torch.finfo(points.dtype).tiny)
-
-    def spread(axis: int) -> Tensor:
+    code = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+    for axis in range(3):
         steps = ((points[:, axis] - low[axis]) / side * (2**BITS - 1)).to(torch.int64)
-        return _spread_bits(steps) << axis
-
-    x, y, z = in_threads(spread, range(3), points.device)
-    code = x | y | z
+        code |= _spread_bits(steps) << axis
     codes, order = torch.sort(code, stable=True)
     if ties is not None and code.device.type != "cpu":  # more work, but no synchronization
         rows = torch.sort(ties, stable=True).indices

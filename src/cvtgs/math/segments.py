@@ -8,8 +8,6 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from cvtgs.devices import in_threads
-
 _WEIGHTS_ONLY_FAIL = torch.torch_version.TorchVersion(torch.__version__) < "2.6"
 """Whether ``embedding_bag`` fails if weights require gradients and the table does not."""
 
@@ -86,17 +84,21 @@ def label_sums(
     count: int,
     weights: Float[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "k m"]:
-    """Sum the rows of each label in their order, in float64: the same bits on every device."""
+    """Sum the rows of each label in their order, in float64: the same bits on every device.
+
+    Each column is summed before the next is requested, so they may share memory.
+    """
     on_host = labels.device.type == "cpu"  # adds in order; CUDA would add in any order
     order, offsets = (labels, labels) if on_host else sort_by_label(labels, count)
-
-    def sum_of(column: Tensor) -> Tensor:
-        values = column.double() if weights is None else weights * column
+    buffer = None if weights is None else torch.empty_like(weights)  # new memory is slow to write
+    sums = []
+    for column in columns:
+        values = column.double() if weights is None else torch.mul(weights, column, out=buffer)
         if on_host:
-            return torch.bincount(labels, values, minlength=count)
-        return segment_sum(values[order], offsets)
-
-    return torch.stack(list(in_threads(sum_of, columns, labels.device)))
+            sums.append(torch.bincount(labels, values, minlength=count))
+        else:
+            sums.append(segment_sum(values[order], offsets))
+    return torch.stack(sums)
 
 
 def label_argmin(
