@@ -115,27 +115,16 @@ def merge_cells(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Members:
-    """The members of some cells, those of one cell contiguous, in float64.
-
-    Attributes:
-        means: ``(n, 3)`` positions.
-        quats: ``(n, 4)`` unit quaternions.
-        scales: ``(n, 3)`` standard deviations.
-        opacities: ``(n,)`` opacities.
-        depths: ``(n,)`` optical depths ``-log(1 - a)``.
-        areas: ``(n,)`` mean projected areas.
-        offsets: ``(m + 1,)`` start of each cell, and the end of the last one.
-        cells: ``(n,)`` cell of every member.
-    """
+    """The members of some cells, those of one cell contiguous, in float64."""
 
     means: Float[Tensor, "n 3"]
-    quats: Float[Tensor, "n 4"]
-    scales: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]  # of unit length
+    scales: Float[Tensor, "n 3"]  # standard deviations
     opacities: Float[Tensor, "n"]
-    depths: Float[Tensor, "n"]
-    areas: Float[Tensor, "n"]
-    offsets: Int[Tensor, "m_plus_1"]
-    cells: Int[Tensor, "n"]
+    depths: Float[Tensor, "n"]  # optical depths, -log(1 - a)
+    areas: Float[Tensor, "n"]  # mean projected areas
+    offsets: Int[Tensor, "m_plus_1"]  # start of each cell, and the end of the last one
+    cells: Int[Tensor, "n"]  # cell of every member
 
     def weights(self, area_power: float) -> Float[Tensor, "n"]:
         """Return the weight of each member in the means of its cell.

@@ -231,17 +231,11 @@ class Partition:
 
 
 class SampledMembers(NamedTuple):
-    """Some members of every cell.
+    """Some members of every cell."""
 
-    Attributes:
-        part: The sampled members.
-        counts: ``(m,)`` number of all members of every cell.
-        rates: ``(n,)`` expected share of members of this mass that are sampled, above 0 to 1.
-    """
-
-    part: Partition
-    counts: Int[Tensor, "m"]
-    rates: Float[Tensor, "n"]
+    part: Partition  # the sampled members
+    counts: Int[Tensor, "m"]  # number of all members of every cell
+    rates: Float[Tensor, "n"]  # expected share of members of this mass that are sampled, above 0
 
 
 def sample_members(scene: GaussianScene, part: Partition) -> SampledMembers:

@@ -37,37 +37,22 @@ LEAST_GAP, LARGEST_GAP = 1e-18, 1e17
 
 
 class Tiles(NamedTuple):
-    """Runs of points that lie close together.
+    """Runs of points that lie close together."""
 
-    Attributes:
-        points: ``(t, p, d)`` positions; in the last tile, some occur twice.
-        bounds: ``(t,)`` squared distance within which every point has its nearest sites.
-        boxes: Lower and upper corners of the points.
-        first: ``(t,)`` the first leaf that its points lie in.
-        last: ``(t,)`` the last leaf that they lie in.
-        reach: ``(t,)`` distance from the middle within which all nearest sites lie.
-    """
-
-    points: Float[Tensor, "t p d"]
-    bounds: Float[Tensor, "t"]
-    boxes: Boxes
-    first: Int[Tensor, "t"]
-    last: Int[Tensor, "t"]
-    reach: Float[Tensor, "t"]
+    points: Float[Tensor, "t p d"]  # in the last tile, some occur twice
+    bounds: Float[Tensor, "t"]  # squared distance within which every point has its nearest sites
+    boxes: Boxes  # around the points
+    first: Int[Tensor, "t"]  # the first leaf that its points lie in
+    last: Int[Tensor, "t"]  # the last one
+    reach: Float[Tensor, "t"]  # distance from the middle within which all nearest sites lie
 
 
 class Candidates(NamedTuple):
-    """Lists of leaves that may hold a nearest site, one after the other.
+    """Lists of leaves that may hold a nearest site, one after the other."""
 
-    Attributes:
-        leaves: ``(p,)`` the leaves of all lists.
-        starts: ``(t,)`` where the list of each tile starts.
-        numbers: ``(t,)`` its length, at least 1.
-    """
-
-    leaves: Int[Tensor, "p"]
-    starts: Int[Tensor, "t"]
-    numbers: Int[Tensor, "t"]
+    leaves: Int[Tensor, "p"]  # the leaves of all lists
+    starts: Int[Tensor, "t"]  # where the list of each tile starts
+    numbers: Int[Tensor, "t"]  # its length, at least 1
 
 
 def nearest_in_tiles(

@@ -12,15 +12,10 @@ FARTHEST = 1e37  # limit of coordinates in float32, in units
 
 
 class Boxes(NamedTuple):
-    """Boxes with axes along the coordinates.
+    """Boxes with axes along the coordinates."""
 
-    Attributes:
-        low: ``(k, d)`` smallest coordinates.
-        high: ``(k, d)`` largest coordinates.
-    """
-
-    low: Float[Tensor, "k d"]
-    high: Float[Tensor, "k d"]
+    low: Float[Tensor, "k d"]  # smallest coordinates
+    high: Float[Tensor, "k d"]  # largest coordinates
 
     @classmethod
     def around(cls, points: Float[Tensor, "k p d"]) -> "Boxes":
@@ -39,18 +34,12 @@ class Boxes(NamedTuple):
 
 
 class Leaves(NamedTuple):
-    """Sites in the leaves of a balanced k-d tree, all of equal size.
+    """Sites in the leaves of a balanced k-d tree, all of equal size."""
 
-    Attributes:
-        sites: ``(b, s, d)`` positions; to fill the leaves, some sites occur twice.
-        rows: ``(b, s)`` their rows.
-        is_filling: ``(b, s)`` whether a site occurs in another place as well.
-        splits: Axis and position of the split of every box, level by level from the root.
-    """
-
-    sites: Float[Tensor, "b s d"]
+    sites: Float[Tensor, "b s d"]  # to fill the leaves, some sites occur twice
     rows: Int[Tensor, "b s"]
-    is_filling: Bool[Tensor, "b s"]
+    is_filling: Bool[Tensor, "b s"]  # whether a site occurs in another place as well
+    # Axis and position of the split of every box, level by level from the root.
     splits: list[tuple[Int[Tensor, "k"], Float[Tensor, "k"]]]
 
 

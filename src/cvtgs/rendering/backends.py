@@ -25,17 +25,11 @@ STAGE = "render"  # stage name in progress events; one step per camera
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RasterOutput:
-    """Images on black, before any background is added.
+    """Images on black, before any background is added."""
 
-    Attributes:
-        rgb: ``(c, h, w, 3)`` sums of the colours, weighted by ``alpha * T``.
-        alpha: ``(c, h, w)`` sums of the weights, 0 to 1.
-        depth: ``(c, h, w)`` sums of the depths, weighted by ``alpha * T``, scene units.
-    """
-
-    rgb: Float[Tensor, "c h w 3"]
-    alpha: Float[Tensor, "c h w"]
-    depth: Float[Tensor, "c h w"]
+    rgb: Float[Tensor, "c h w 3"]  # sums of the colours, weighted by alpha * T
+    alpha: Float[Tensor, "c h w"]  # sums of the weights, 0 to 1
+    depth: Float[Tensor, "c h w"]  # sums of the depths, weighted by alpha * T, scene units
 
 
 class BlendingWeights(Protocol):

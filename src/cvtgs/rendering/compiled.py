@@ -131,46 +131,28 @@ class GaussianArrays(NamedTuple):
 
 
 class RasterSettings(NamedTuple):
-    """One camera, and the settings for colours and opacities.
+    """One camera, and the settings for colours and opacities."""
 
-    Attributes:
-        camera: ``(9, 3)`` rotation (rows 0 to 2), centre (3), focal lengths (4), principal point
-            (5), slope bounds along x (6) and along y (7), width and height (8). Pairs are padded
-            with 0; row 8 ends with the dilation, squared pixels.
-        size: Width and height, pixels.
-        sh_degree: Highest SH degree to evaluate.
-        antialiased: Whether to compensate opacities for the dilation.
-    """
-
+    # (9, 3): rotation (rows 0 to 2), centre (3), focal lengths (4), principal point (5), slope
+    # bounds along x (6) and y (7), width and height (8). Pairs are padded with 0; row 8 ends with
+    # the dilation, squared pixels.
     camera: NDArray[np.float64]
-    size: tuple[int, int]
-    sh_degree: int
-    antialiased: bool
+    size: tuple[int, int]  # width and height, pixels
+    sh_degree: int  # highest SH degree to evaluate
+    antialiased: bool  # whether to compensate opacities for the dilation
 
 
 class TileArrays(NamedTuple):
-    """The splats of each tile, front to back.
+    """The splats of each tile, front to back."""
 
-    Attributes:
-        starts: ``(t + 1,)`` start of each tile's list.
-        lists: ``(p, 2)`` for each intersection: its index in splat order, and its splat.
-        side: Pixels along a tile's edge.
-    """
-
-    starts: Ints
-    lists: Ints
-    side: int
+    starts: Ints  # (t + 1,) start of each tile's list
+    lists: Ints  # (p, 2) for each intersection: its index in splat order, and its splat
+    side: int  # pixels along a tile's edge
 
 
 class SplatArrays(NamedTuple):
-    """The splats in view, front to back.
+    """The splats in view, front to back."""
 
-    Attributes:
-        rows: ``(m,)`` row of the Gaussian in the scene.
-        starts: ``(m + 1,)`` start of each splat's intersections, in splat order.
-        packed: ``(m, 10)`` as returned by :func:`cvtgs.rendering.projection.pack`.
-    """
-
-    rows: Ints
-    starts: Ints
-    packed: Array
+    rows: Ints  # (m,) row of the Gaussian in the scene
+    starts: Ints  # (m + 1,) start of each splat's intersections, in splat order
+    packed: Array  # (m, 10) as returned by `cvtgs.rendering.projection.pack`

@@ -25,18 +25,11 @@ from cvtgs.rendering.projection import MAX_ALPHA, MIN_TRANSMITTANCE
 
 
 class WeightArrays(NamedTuple):
-    """Weights ``alpha * T`` of the splats of each tile, in the order of the tiles' lists.
+    """Weights ``alpha * T`` of the splats of each tile, in the order of the tiles' lists."""
 
-    Attributes:
-        starts: ``(p + 1,)`` start of each intersection's weights.
-        counts: ``(p,)`` number of weights of each intersection.
-        pixels: Index of the weight's pixel within its tile.
-        values: The weights.
-    """
-
-    starts: Ints
-    counts: Ints
-    pixels: NDArray[np.uint8]
+    starts: Ints  # (p + 1,) start of each intersection's weights
+    counts: Ints  # (p,) number of weights of each intersection
+    pixels: NDArray[np.uint8]  # index of the weight's pixel within its tile
     values: NDArray[np.float32]
 
 

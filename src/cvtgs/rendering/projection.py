@@ -33,25 +33,15 @@ after a uniform scale of the view is divided out."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pinhole:
-    """A pinhole camera as plain Python numbers.
+    """A pinhole camera as plain Python numbers."""
 
-    Attributes:
-        rotation: Rows of the 3 x 3 linear part of the view matrix.
-        center: Position of the camera in world space.
-        focal: Focal lengths along x and y, pixels.
-        principal: Principal point, pixels.
-        size: Width and height, pixels.
-        dilation: Variance added to every projected Gaussian, squared pixels.
-        ignores_tag: Whether scenes tagged mip are rendered without compensation.
-    """
-
-    rotation: tuple[tuple[float, float, float], ...]
-    center: tuple[float, float, float]
-    focal: tuple[float, float]
-    principal: tuple[float, float]
-    size: tuple[int, int]
-    dilation: float
-    ignores_tag: bool
+    rotation: tuple[tuple[float, float, float], ...]  # rows of the linear part of the view matrix
+    center: tuple[float, float, float]  # position in world space
+    focal: tuple[float, float]  # along x and y, pixels
+    principal: tuple[float, float]  # pixels
+    size: tuple[int, int]  # width and height, pixels
+    dilation: float  # variance added to every projected Gaussian, squared pixels
+    ignores_tag: bool  # whether scenes tagged mip are rendered without compensation
 
     @property
     def slopes(self) -> list[tuple[float, float]]:
@@ -159,22 +149,14 @@ class Splats:
     With ``(u, v)`` the offset of a pixel from the centre, the squared Mahalanobis distance is
     ``steep (u + shear v)^2 + flat v^2``. This is the conic of 3DGS, ``A u^2 + 2 B u v + C v^2``,
     as ``L D L^T``: it is never negative and stays accurate for needles of any length.
-
-    Attributes:
-        rows: ``(m,)`` row of the Gaussian in the scene.
-        centers: ``(m, 2)`` pixels.
-        ellipses: ``(m, 3)`` steep and flat (1 / squared pixels), shear (no unit) between them.
-        opacities: ``(m,)`` at the centre, above 1/255.
-        colors: ``(m, 3)`` red, green, blue, at least 0.
-        depths: ``(m,)`` along the view axis, scene units, ascending.
     """
 
-    rows: Int[Tensor, "m"]
-    centers: Float[Tensor, "m 2"]
-    ellipses: Float[Tensor, "m 3"]
-    opacities: Float[Tensor, "m"]
-    colors: Float[Tensor, "m 3"]
-    depths: Float[Tensor, "m"]
+    rows: Int[Tensor, "m"]  # row of the Gaussian in the scene
+    centers: Float[Tensor, "m 2"]  # pixels
+    ellipses: Float[Tensor, "m 3"]  # steep, shear (no unit), flat; in 1 / squared pixels
+    opacities: Float[Tensor, "m"]  # at the centre, above 1/255
+    colors: Float[Tensor, "m 3"]  # red, green, blue, at least 0
+    depths: Float[Tensor, "m"]  # along the view axis, scene units, ascending
 
 
 def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:

@@ -44,23 +44,14 @@ _SLACK = 1e-3  # pixels by which boxes are enlarged, so that rounding omits noth
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TileLists:
-    """The splats of each tile, front to back.
+    """The splats of each tile, front to back."""
 
-    Attributes:
-        splats: ``(p,)`` splat of each intersection; sorted by tile, then by depth.
-        starts: ``(t + 1,)`` start of each tile's list; tiles are in row-major order.
-        ranks: ``(p,)`` index of each intersection in splat order (by splat, then by tile).
-        splat_starts: ``(m + 1,)`` start of each splat's intersections in splat order.
-        side: Pixels along a tile's edge.
-        across: Tiles per row.
-    """
-
-    splats: Int[Tensor, "p"]
-    starts: Int[Tensor, "t_plus_1"]
-    ranks: Int[Tensor, "p"]
-    splat_starts: Int[Tensor, "m_plus_1"]
-    side: int
-    across: int
+    splats: Int[Tensor, "p"]  # splat of each intersection; sorted by tile, then by depth
+    starts: Int[Tensor, "t_plus_1"]  # start of each tile's list; tiles are in row-major order
+    ranks: Int[Tensor, "p"]  # index of each intersection in splat order (by splat, then by tile)
+    splat_starts: Int[Tensor, "m_plus_1"]  # start of each splat's intersections
+    side: int  # pixels along a tile's edge
+    across: int  # tiles per row
 
 
 def require(device: torch.device) -> None:
@@ -228,29 +219,17 @@ def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TileBatch:
-    """The next splats of some tiles, and their weights in the tiles' pixels.
+    """The next splats of some tiles, and their weights in the tiles' pixels."""
 
-    Attributes:
-        tiles: ``(b,)`` indices of the tiles.
-        entries: ``(b, k)`` indices into the lists; 0 for padding.
-        valid: ``(b, k)`` False for padding.
-        params: ``(b, k, 10)`` packed splats.
-        along: ``(b, k, s, s)`` offset along x from the centre plus shear times ``down``, pixels.
-        down: ``(b, k, s)`` offset along y from the centre, pixels.
-        alpha: ``(b, k, q)`` alpha of each splat in each pixel, 0 where it is skipped.
-        transmittance: ``(b, k, q)`` in front of each splat, 0 where the pixel is finished.
-        remaining: ``(b, q)`` transmittance behind the last splat of a pixel; infinite if none.
-    """
-
-    tiles: Int[Tensor, "b"]
-    entries: Int[Tensor, "b k"]
-    valid: Bool[Tensor, "b k"]
-    params: Float[Tensor, "b k 10"]
-    along: Float[Tensor, "b k s s"]
-    down: Float[Tensor, "b k s"]
-    alpha: Float[Tensor, "b k q"]
-    transmittance: Float[Tensor, "b k q"]
-    remaining: Float[Tensor, "b q"]
+    tiles: Int[Tensor, "b"]  # indices of the tiles
+    entries: Int[Tensor, "b k"]  # indices into the lists; 0 for padding
+    valid: Bool[Tensor, "b k"]  # False for padding
+    params: Float[Tensor, "b k 10"]  # packed splats
+    along: Float[Tensor, "b k s s"]  # offset along x from the centre plus shear times `down`
+    down: Float[Tensor, "b k s"]  # offset along y from the centre, pixels
+    alpha: Float[Tensor, "b k q"]  # alpha of each splat in each pixel, 0 where it is skipped
+    transmittance: Float[Tensor, "b k q"]  # in front of each splat, 0 where the pixel is finished
+    remaining: Float[Tensor, "b q"]  # transmittance behind the last splat; infinite if none
 
 
 def composite(packed: Float[Tensor, "m 10"], lists: TileLists) -> Float[Tensor, "t q 5"]:
