@@ -64,20 +64,15 @@ def target_count(
         >>> target_count(250, 0.01), target_count(10, 1e-9)
         (3, 1)
     """
-    if whole_number(total) < 0:
-        raise InvalidArgumentError(f"total must be a whole number, at least 0; found {total!r}.")
+    check_whole(total, "total", least=0)
     values = {"rho": rho, "count": count, "max_count": max_count}
     given = [name for name, value in values.items() if value is not None]
     if len(given) != 1:
         found = " and ".join(given) or "none"
         raise InvalidArgumentError(f"give one of rho, count and max_count, found {found}.")
     if max_count is not None:
-        most = whole_number(max_count)
-        if most < 1:
-            raise InvalidArgumentError(
-                f"max_count must be a whole number above 0; found {max_count!r}."
-            )
-        return min(most, total)
+        check_whole(max_count, "max_count")
+        return min(whole_number(max_count), total)
     if count is not None:
         number = whole_number(count)
         if not 1 <= number <= total:
@@ -90,7 +85,7 @@ def target_count(
                 f"found {found}."
             )
         return number
-    if rho is None or not _is_ratio(rho):
+    if rho is None or not 0.0 < real_number(rho) <= 1.0:
         kind = "" if type(rho) in (int, float) else "a number "
         raise InvalidArgumentError(f"rho must be {kind}above 0 and at most 1; found {rho!r}.")
     near = round(float(rho) * total)
@@ -107,10 +102,6 @@ def written(number: "float | Tensor") -> str:
         lacking = str(value.dtype) == "torch.bfloat16"  # in numpy
         value = (value.float() if lacking else value).numpy().reshape(())[()]
     return str(value) if "float" in type(value).__name__ else str(float(value))
-
-
-def _is_ratio(value: object) -> bool:
-    return 0.0 < real_number(value) <= 1.0
 
 
 def check_share(value: object, name: str) -> None:

@@ -63,15 +63,13 @@ def filter_rows(
             f"found one of {len(opacities):,}."
         )
     check_whole(target, "target", most=len(scene), things="Gaussians of the scene")
-    keep, share = opacities >= config.min_opacity, config.max_mass_share
-    if not analysis.plan.haze.active:
-        share = 1.0
-    if analysis.plan.haze.active or int(keep.sum()) < target:
+    keep, is_hazy = opacities >= config.min_opacity, analysis.plan.haze.active
+    if is_hazy or int(keep.sum()) < target:
         keep = visible_rows(
             opacities,
             analysis.apparent_areas * opacities,
             min_opacity=config.min_opacity,
-            max_mass_share=share,
+            max_mass_share=config.max_mass_share if is_hazy else 1.0,
             at_least=target,
         )
     masses = analysis.areas * opacities

@@ -203,7 +203,7 @@ def test_ratios_of_other_types_are_errors(rho):
 
 @pytest.mark.parametrize("total", [-1, 100.5, "100"])
 def test_totals_that_are_no_count_are_errors(total):
-    with pytest.raises(InvalidArgumentError, match="total must be a whole number, at least 0"):
+    with pytest.raises(InvalidArgumentError, match="total must be a whole number at least 0"):
         target_count(total, 0.1)
 
 

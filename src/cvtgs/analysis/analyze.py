@@ -146,8 +146,7 @@ def measure_visibility(
     else:
         rendered = contributions(used, views)
     opacities, apparent = analysis.opacities, analysis.apparent_areas
-    shows = float(rendered.sum()) > 0.0
-    if shows:
+    if float(rendered.sum()) > 0.0:
         apparent = measured_areas(
             apparent,
             opacities,

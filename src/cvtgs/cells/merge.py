@@ -91,8 +91,7 @@ def merge_cells(
                 merged_depth(members, areas, rule=config.opacity, antialiased=scene.antialiased)
             ),
         }
-        bands = ("sh0", "shN") if scene.shN.shape[1] else ("sh0",)
-        for name in bands:
+        for name in ("sh0", "shN"):
             values = getattr(scene, name).index_select(0, rows).double()
             new[name] = segment_sum(values, offsets, weights)
         for name, values in new.items():
@@ -127,15 +126,7 @@ class Members:
     cells: Int[Tensor, "n"]  # cell of every member
 
     def weights(self, area_power: float) -> Float[Tensor, "n"]:
-        """Return the weight of each member in the means of its cell.
-
-        Args:
-            area_power: The weight is the opacity times the area to this power: 0 as in CVT-GS,
-                1 for the mass.
-
-        Returns:
-            Weights; those of one cell sum to 1.
-        """
+        """Return opacities times areas to a power, scaled to a sum of 1 in each cell."""
         weights = self.opacities
         if area_power != 0.0:
             largest = segment_max(self.areas, self.offsets).index_select(0, self.cells)
