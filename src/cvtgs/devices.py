@@ -260,27 +260,6 @@ def _limit_own(before: int) -> None:
 
 
 @contextmanager
-def _restored_threads() -> Iterator[int]:
-    """Restore torch's number of threads at the end; yield it.
-
-    Threads of the program that start at the moment when a call limits torch take its limit, 1, for
-    their own number, so they get that of the first call instead.
-    """
-    with _Limits.lock:
-        own = torch.get_num_threads()
-        if _Limits.running == 0:
-            _Limits.threads = own
-        before = own if own > 1 else _Limits.threads
-        _Limits.running += 1
-    try:
-        yield before
-    finally:
-        with _Limits.lock:
-            _Limits.running -= 1
-            torch.set_num_threads(before)
-
-
-@contextmanager
 def without_autocast() -> Iterator[None]:
     """Compute in the dtypes of the tensors, even if the program has switched autocast on."""
     with ExitStack() as stack:
@@ -309,13 +288,23 @@ def one_thread() -> Iterator[int]:
     if _OWN.is_limited:
         yield _OWN.spare
         return
-    with _restored_threads() as before:
+    with _Limits.lock:
+        own = torch.get_num_threads()
+        if _Limits.running == 0:
+            _Limits.threads = own
+        # Threads of the program that start at the moment when a call limits torch take its limit,
+        # 1, for their own number, so they get that of the first call instead.
+        before = own if own > 1 else _Limits.threads
+        _Limits.running += 1
+    try:
         _OWN.is_limited, _OWN.spare = True, before
         _limit_own(before)
-        try:
-            yield before
-        finally:
-            _OWN.is_limited, _OWN.spare = False, 1
+        yield before
+    finally:
+        _OWN.is_limited, _OWN.spare = False, 1
+        with _Limits.lock:
+            _Limits.running -= 1
+            torch.set_num_threads(before)
 
 
 @contextmanager

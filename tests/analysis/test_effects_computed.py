@@ -189,7 +189,7 @@ def test_duplicates_are_searched_once(monkeypatch):
     """The result is the same, also with more cells than distinct places."""
     scene = random_scene(300).select(torch.arange(300).repeat(3))
     searched = []
-    home = import_module("cvtgs.cvt.tessellate")
+    home = import_module("cvtgs.cvt.nearest")
     original = home.nearest_site
     monkeypatch.setattr(
         home,

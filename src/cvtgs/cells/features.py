@@ -64,8 +64,6 @@ class NeighborContext(NamedTuple):
 
     def cut(self, run: slice) -> Self:
         """Keep some consecutive cells."""
-        if run.start == 0 and run.stop >= len(self.cover):
-            return self
         merged = ActivatedGaussians(*(values[run] for values in self.merged))
         return type(self)(merged, *(values[run] for values in self[1:]))
 

@@ -263,16 +263,19 @@ def runs_of_equal(sites: Float[Tensor, "m d"]) -> tuple[Int[Tensor, "m"], Int[Te
     return order, places - starts
 
 
-def search_once_per_position(nearest: NearestSite) -> NearestSite:
-    """Return a search that looks up runs of equal points only once, with the same results."""
+def choose_search(*, has_duplicates: bool) -> NearestSite:
+    """Choose the search; with many duplicates, each position is searched once."""
+    return search_once_per_position if has_duplicates else nearest_site
 
-    def search(points: Tensor, sites: Tensor) -> tuple[Tensor, Tensor]:
-        is_first = first_of_each(points)
-        labels, squared = nearest(points[is_first], sites)
-        numbers = is_first.cumsum(0) - 1
-        return labels[numbers], squared[numbers]
 
-    return search
+def search_once_per_position(
+    points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"]
+) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
+    """Return what :func:`nearest_site` does, but look up runs of equal points only once."""
+    is_first = first_of_each(points)
+    labels, squared = nearest_site(points[is_first], sites)
+    numbers = is_first.cumsum(0) - 1
+    return labels[numbers], squared[numbers]
 
 
 def first_of_each(points: Float[Tensor, "n d"]) -> Bool[Tensor, "n"]:

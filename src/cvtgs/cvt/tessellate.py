@@ -11,7 +11,7 @@ from torch import Tensor
 from cvtgs.checks import check_range, checked
 from cvtgs.config import TessellationConfig
 from cvtgs.counts import check_whole
-from cvtgs.cvt.nearest import NearestSite, nearest_site, search_device, search_once_per_position
+from cvtgs.cvt.nearest import NearestSite, choose_search, search_device
 from cvtgs.cvt.seeding import choose_seeds, stratified_seeds
 from cvtgs.devices import move_together
 from cvtgs.errors import InvalidArgumentError
@@ -106,11 +106,6 @@ def tessellate(
         energy=float((weights * squared).sum()),
         refilled=refilled,
     )
-
-
-def choose_search(*, has_duplicates: bool) -> NearestSite:
-    """Choose the search; with many duplicates, each position is searched once."""
-    return search_once_per_position(nearest_site) if has_duplicates else nearest_site
 
 
 def sample_points(

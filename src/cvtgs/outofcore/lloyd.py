@@ -9,7 +9,8 @@ from torch import Tensor
 
 from cvtgs.analysis import SceneAnalysis
 from cvtgs.cvt import choose_seeds, gaussian_weights, nearest_site
-from cvtgs.cvt.tessellate import centroids, choose_search, sample_points, weighted_sums
+from cvtgs.cvt.nearest import choose_search
+from cvtgs.cvt.tessellate import centroids, sample_points, weighted_sums
 from cvtgs.devices import one_thread
 from cvtgs.grouping import curve_order, embed_rows
 from cvtgs.math.segments import label_argmin, sort_by_label
