@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.counts import whole_number
-from cvtgs.devices import in_chunks, usable_device
+from cvtgs.devices import row_chunks, usable_device
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.selection import row_numbers
@@ -137,12 +137,10 @@ class GaussianScene:
     @property
     def areas(self) -> Float[Tensor, "n"]:
         """Mean projected areas of the one-sigma ellipsoids, squared scene units, float64."""
-        logs = self.log_scales
-
-        def areas_of(part: slice) -> Tensor:
-            return parameters.mean_projected_area(torch.exp(logs[part].double()))
-
-        return torch.cat(in_chunks(areas_of, len(logs), _CHUNK, logs.device))
+        areas = self.log_scales.new_empty(len(self.means), dtype=torch.float64)
+        for part in row_chunks(len(areas), _CHUNK, areas.device):
+            areas[part] = parameters.mean_projected_area(torch.exp(self.log_scales[part].double()))
+        return areas
 
     @property
     def masses(self) -> Float[Tensor, "n"]:

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.devices import in_chunks, in_threads, row_chunks
+from cvtgs.devices import row_chunks
 from cvtgs.math.frames import RobustFrame
 
 VOXEL = 0.04  # side of a voxel, in robust radii of contracted space
@@ -59,18 +59,15 @@ def add_depths(
     frame: RobustFrame,
 ) -> Int[Tensor, "n"]:
     """Add the optical depths of some Gaussians to a grid, in place; return the voxel of each."""
-
-    def depths_of(part: slice) -> tuple[Tensor, Tensor]:
-        voxels, shrinkage = _voxels_of(means[part], frame)
+    voxels = torch.empty(len(means), dtype=torch.int32, device=means.device)
+    for part in row_chunks(len(means), CHUNK, means.device):
+        voxel, shrinkage = _voxels_of(means[part], frame)
+        voxels[part] = voxel.to(torch.int32)
         depths = masses[part] * (shrinkage / (frame.radius * VOXEL)).square()
-        return voxels, (depths.clamp_max(MAX_DEPTH) * FIXED_POINT).round().to(torch.int64)
-
-    found, chunks = [sums[:0].to(torch.int32)], row_chunks(len(means), CHUNK, means.device)
-    for voxels, depths in in_threads(depths_of, chunks, means.device):
         # Integer sums do not depend on the order, so every device gives the same grid.
-        sums.index_add_(0, voxels, depths)
-        found.append(voxels.to(torch.int32))
-    return torch.cat(found)
+        whole = (depths.clamp_max(MAX_DEPTH) * FIXED_POINT).round().to(torch.int64)
+        sums.index_add_(0, voxel, whole)
+    return voxels
 
 
 def visibility_grid(sums: Int[Tensor, "voxels"]) -> Float[Tensor, "voxels"]:
@@ -92,11 +89,9 @@ def visibility_at(
     grid: Float[Tensor, "voxels"], means: Float[Tensor, "n 3"], frame: RobustFrame
 ) -> Float[Tensor, "n"]:
     """Look up the ambient visibility of Gaussians in a :func:`visibility_grid`."""
-
-    def visible_at(part: slice) -> Tensor:
-        return grid[_voxels_of(means[part], frame)[0]]
-
-    return torch.cat(in_chunks(visible_at, len(means), CHUNK, means.device)).double()
+    chunks = row_chunks(len(means), CHUNK, means.device)
+    parts = [grid[_voxels_of(means[part], frame)[0]] for part in chunks]
+    return torch.cat([grid[:0], *parts]).double()
 
 
 def _voxels_of(

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.devices import in_chunks
+from cvtgs.devices import row_chunks
 
 RADIUS_QUANTILE = 0.7  # the share of points within the radius of a frame
 CHUNK = 1 << 16  # points per chunk, to bound memory
@@ -54,12 +54,10 @@ class RobustFrame:
         Returns:
             Distances in float64.
         """
-
-        def distances_of(part: slice) -> Tensor:
-            norms: Tensor = torch.linalg.vector_norm(self.normalize(points[part]), dim=1)
-            return norms
-
-        return torch.cat(in_chunks(distances_of, len(points), CHUNK, points.device))
+        found = torch.empty(len(points), dtype=torch.float64, device=points.device)
+        for part in row_chunks(len(points), CHUNK, points.device):
+            found[part] = torch.linalg.vector_norm(self.normalize(points[part]), dim=1)
+        return found
 
     def contract(self, points: Float[Tensor, "n 3"], strength: float = 1.0) -> Float[Tensor, "n 3"]:
         """Express points in radii, and contract those beyond one radius logarithmically.
