@@ -155,18 +155,19 @@ def test_steps_towards_held_out_images_are_from_none_to_the_whole(residual, step
     assert matching.best_step([blank], torch.zeros(1, 1, 3)) == 0.0
 
 
-def test_the_ridge_has_a_floor_of_a_fiftieth_of_the_median_weight():
+@pytest.mark.parametrize(("slope", "color"), [(1.5, 3 / 2.52), (-9.0, 0.0)])
+def test_the_ridge_has_a_floor_of_a_fiftieth_of_the_median_weight(slope, color):
     """Weights add up to 2, their squares to 1.5: the solution is ``3 / (1.5 + 0.5 * 2.04)``."""
     weights = SimpleNamespace(powers=lambda: torch.tensor([[2.0, 1.5]]).double())
     view = SimpleNamespace(
         weights=weights,
         basis=torch.ones(1, 1).double(),
-        normal=lambda changes: 1.5 * changes,
+        normal=lambda changes: slope * changes,
         gradient=lambda: torch.full((1, 1, 3), 3.0).double(),
     )
     config = MatchConfig(color_ridge=0.5)
     found = matching.LeastSquares([view], config=config, frozen=0).solve(3)
-    assert found.flatten().tolist() == pytest.approx([3 / 2.52] * 3)
+    assert found.flatten().tolist() == pytest.approx([color] * 3)
 
 
 @pytest.mark.parametrize(("step", "solved"), [(0.6, [14, 16]), (0.4, [14])])

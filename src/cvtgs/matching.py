@@ -185,12 +185,12 @@ class LeastSquares:
         direction, old = scaled, _dots(residual, scaled)
         for _ in range(iterations):
             image = self._product(direction)
-            length = parameters.divide(old, _dots(direction, image)).to(found.dtype)
+            length = _divided(old, _dots(direction, image)).to(found.dtype)
             found = found + length * direction
             residual = residual - length * image
             scaled = self._inverse * residual
             new = _dots(residual, scaled)
-            direction = scaled + parameters.divide(new, old).to(found.dtype) * direction
+            direction = scaled + _divided(new, old).to(found.dtype) * direction
             old = new
         return found
 
@@ -203,6 +203,11 @@ class LeastSquares:
 
 def _dots(one: Float[Tensor, "m k 3"], other: Float[Tensor, "m k 3"]) -> Float[Tensor, "3"]:
     return (one.double() * other.double()).sum(dim=(0, 1))
+
+
+def _divided(above: Float[Tensor, "3"], below: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """Divide; 0 where rounding leaves nothing, or less, to divide by."""
+    return torch.where(below > 0, above / below.clamp_min(1e-300), 0.0)
 
 
 class Matched(NamedTuple):
