@@ -11,7 +11,7 @@ from typing import NoReturn
 import pytest
 
 from cvtgs.errors import FileFormatError, OutputError, OutputExistsError
-from cvtgs.io import atomic_output, check_output, check_save
+from cvtgs.io import atomic, atomic_output, check_output, check_save
 
 
 def write(path: Path, data: bytes = b"new", *, overwrite: bool = False) -> None:
@@ -87,6 +87,14 @@ def refuse(*args: object) -> NoReturn:
     raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
 
 
+@pytest.fixture(params=["rename", "claim"])
+def last_resort(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fallbacks without hard links: a rename that never replaces, or not even that."""
+    if request.param == "claim":
+        monkeypatch.setattr(atomic, "_rename", refuse)
+
+
+@pytest.mark.usefixtures("last_resort")
 @pytest.mark.parametrize("number", [errno.EPERM, errno.EOPNOTSUPP, errno.EMLINK])
 def test_without_hard_links_the_result_is_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
@@ -106,6 +114,7 @@ def test_without_hard_links_the_result_is_the_same(
 
 def test_a_failed_rename_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "link", refuse)
+    monkeypatch.setattr(atomic, "_rename", refuse)
     monkeypatch.setattr(Path, "replace", refuse)
     with pytest.raises(OutputError):
         write(tmp_path / "c.bin")
@@ -115,6 +124,16 @@ def test_a_failed_rename_leaves_no_file(tmp_path: Path, monkeypatch: pytest.Monk
 def test_a_too_long_file_name_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="file name too long"):
         check_output(tmp_path / ("n" * 300))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the rename of Linux")
+def test_without_hard_links_no_empty_file_is_created(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "link", refuse)
+    monkeypatch.setattr(atomic, "_claim", refuse)
+    write(tmp_path / "a.bin")
+    assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"new"]
 
 
 @pytest.mark.parametrize("error", [OSError(errno.EIO, "bad"), KeyboardInterrupt()])
@@ -136,6 +155,7 @@ def test_the_empty_file_is_removed_after_a_failure(
         raise error
 
     monkeypatch.setattr(os, "link", refuse)
+    monkeypatch.setattr(atomic, "_rename", refuse)
     monkeypatch.setattr(Path, "replace", fail)
     with pytest.raises((OutputError, KeyboardInterrupt)):
         write(path)

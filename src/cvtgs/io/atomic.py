@@ -1,5 +1,6 @@
 """Write a file completely or not at all."""
 
+import ctypes
 import errno
 import os
 import secrets
@@ -18,6 +19,9 @@ try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
+
+_HERE, _NO_REPLACE = -100, 1
+"""AT_FDCWD and RENAME_NOREPLACE of Linux."""
 
 _WINDOWS = os.name == "nt"
 _RESERVED = {
@@ -115,10 +119,9 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
     """
     check_output(path, overwrite)
     target = _target(path)
-    temporary = None
+    temporary, file = None, None
     try:
         temporary, file = _open_temporary(target)
-        own = os.fstat(file.fileno())
         with file:
             try:
                 yield file
@@ -127,7 +130,7 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
                 if fcntl is not None:  # still locked, so not seen as a leftover
                     _publish(temporary, target, overwrite=overwrite)
             finally:
-                if fcntl is not None and _is_same(temporary, own):
+                if fcntl is not None and _is_own(temporary, file):
                     temporary.unlink()
         if fcntl is None:
             _publish(temporary, target, overwrite=overwrite)
@@ -211,11 +214,11 @@ def _remove_leftover(temporary: Path) -> None:
             os.close(descriptor)
 
 
-def _is_same(path: Path, own: os.stat_result) -> bool:
-    """Return whether a path still names the file that we made, not one created after it moved."""
+def _is_own(temporary: Path, file: BinaryIO) -> bool:
+    """Return whether a path still names the open file, not one created after it moved."""
     try:
-        return os.path.samestat(path.lstat(), own)
-    except OSError:
+        return os.path.samestat(temporary.lstat(), os.fstat(file.fileno()))
+    except (OSError, ValueError):
         return False
 
 
@@ -233,12 +236,15 @@ def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
         replace_file(temporary, target)
         return
-    try:
-        target.hardlink_to(temporary)  # unlike a rename, a link never replaces
-    except FileExistsError:
-        raise
-    except (OSError, NotImplementedError):  # some disks have no hard links (FAT, some shares)
-        _claim(temporary, target)
+    for take in (_link, _rename):
+        try:
+            take(temporary, target)
+        except FileExistsError:
+            raise
+        except (OSError, NotImplementedError):  # not supported by this system or disk
+            continue
+        return
+    _claim(temporary, target)
 
 
 def replace_file(source: Path, target: Path) -> None:
@@ -253,6 +259,25 @@ def replace_file(source: Path, target: Path) -> None:
     source.replace(target)
 
 
+def _link(temporary: Path, target: Path) -> None:
+    """Create a hard link unless the name exists: unlike a rename, a link never replaces."""
+    target.hardlink_to(temporary)
+
+
+def _rename(temporary: Path, target: Path) -> None:
+    """Rename unless the name exists, for disks without hard links (FAT, some shares)."""
+    if os.name == "nt":
+        temporary.rename(target)  # on Windows, this never replaces
+        return
+    libc = ctypes.CDLL(None, use_errno=True)
+    if not hasattr(libc, "renameat2"):
+        raise NotImplementedError
+    names = (os.fsencode(temporary), os.fsencode(target))
+    if libc.renameat2(_HERE, names[0], _HERE, names[1], ctypes.c_uint(_NO_REPLACE)):
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number), os.fspath(target))
+
+
 def _claim(temporary: Path, target: Path) -> None:
     """Create an empty file and replace it; only a kill in between leaves the empty file."""
     own = None
@@ -261,9 +286,18 @@ def _claim(temporary: Path, target: Path) -> None:
             own = os.fstat(file.fileno())
         temporary.replace(target)
     except BaseException:
-        if own is not None and _is_same(target, own) and target.stat().st_size == 0:
+        if own is not None and _is(target, own):
             target.unlink()
         raise
+
+
+def _is(path: Path, empty: os.stat_result) -> bool:
+    """Return whether a path is still the empty file that we made."""
+    try:
+        found = path.stat()
+    except OSError:
+        return False
+    return os.path.samestat(found, empty) and found.st_size == 0
 
 
 def _concerns(error: OSError, target: Path) -> bool:
