@@ -13,7 +13,8 @@ import gsplat_stand_in
 from cvtgs import GaussianScene
 from cvtgs.cameras import Cameras
 from cvtgs.errors import MissingDependencyError
-from cvtgs.rendering import choose_backend, contributions, gsplat_backend, projection, render
+from cvtgs.rendering import choose_backend, gsplat_backend, projection, render
+from cvtgs.rendering.render import contributions_to_each
 from render_cases import MIP, around, oracle_images, scene_of, straight
 from scenes import random_scene
 
@@ -204,13 +205,18 @@ def test_gradients(install, name, comments):
     torch.testing.assert_close(*gradients, rtol=1e-3, atol=limit)
 
 
-def test_contributions(install):
+@pytest.mark.parametrize("together", [1, 50, 1000])
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_contributions_to_each_image(install, monkeypatch, mode, together):
     install(gsplat_stand_in.rasterization)
+    monkeypatch.setattr(gsplat_backend, "TOGETHER", together)
     scene = random_scene(20, seed=5).with_tensors({"logit_opacities": torch.zeros(20)}, {})
-    with torch.no_grad():
-        found = contributions(scene, around(), backend="gsplat")
-    wanted = contributions(scene, around(), backend="torch")
-    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-2)
+    for cameras in (around(3), around(3).in_two_sizes(2)):
+        with mode():
+            found = torch.stack(list(contributions_to_each(scene, cameras, backend="gsplat")))
+        wanted = torch.stack(list(contributions_to_each(scene, cameras, backend="torch")))
+        assert found.shape == (3, 20)
+        torch.testing.assert_close(found.clone(), wanted, rtol=1e-4, atol=1e-2)
 
 
 def test_empty(install):
@@ -270,7 +276,7 @@ def test_a_uniform_scale_of_a_view_does_not_reach_gsplat(monkeypatch):
     torch.testing.assert_close(*found)
 
 
-def test_cameras_that_treat_the_tag_differently_are_rendered_one_by_one(monkeypatch):
+def test_cameras_that_treat_the_tag_alike_are_rendered_together(monkeypatch):
     modes = []
 
     def rasterization(**options):
@@ -283,13 +289,16 @@ def test_cameras_that_treat_the_tag_differently_are_rendered_one_by_one(monkeypa
     gsplat_backend.rasterize(scene, cameras, sh_degree=0)
     ignoring = replace(cameras, ignores_tag=(True, True, True))
     gsplat_backend.rasterize(scene, ignoring, sh_degree=0)
-    output = gsplat_backend.rasterize(scene, cameras.in_both_modes(), sh_degree=0)
-    single = (1, "antialiased")
-    assert modes == [(3, "antialiased"), (3, "classic"), single, single, (1, "classic")]
-    assert output.rgb.shape == (3, cameras.height, cameras.width, 3)
+    mixed = replace(cameras, ignores_tag=(False, True, False))
+    output = gsplat_backend.rasterize(scene, mixed, sh_degree=0)
+    assert modes == [(3, "antialiased"), (3, "classic"), (2, "antialiased"), (1, "classic")]
+    monkeypatch.setattr(gsplat_backend, "TOGETHER", 1)
+    alone = gsplat_backend.rasterize(scene, mixed, sh_degree=0)
+    assert [number for number, _ in modes[4:]] == [1, 1, 1]
+    torch.testing.assert_close(output.rgb, alone.rgb)  # in the order of the cameras
 
 
-def test_cameras_of_two_sizes_are_rendered_one_by_one(monkeypatch):
+def test_cameras_of_two_sizes_are_rendered_apart(monkeypatch):
     widened = []
 
     def rasterization(**options):

@@ -13,7 +13,6 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError, InvalidArgumentError, MissingDependencyError
 from cvtgs.math import segments
-from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.progress import ProgressEvent, ProgressListener
 from cvtgs.scene import GaussianScene
 
@@ -145,35 +144,28 @@ def collect_images(
     return RasterOutput(rgb=layers[..., :3], depth=layers[..., 3], alpha=1 - layers[..., 4])
 
 
-def contributions_by_gradient(
-    rasterize: Callable[..., RasterOutput], scene: GaussianScene, cameras: Cameras
-) -> Iterator[Float[Tensor, "n"]]:
-    """Compute contributions as gradients of summed images with respect to the colours."""
-    for camera in cameras.singles():
-        with torch.inference_mode(mode=False), torch.enable_grad():
-            # Mid-grey, so that no colour is clipped; the higher SH bands do not matter here.
-            sh0 = torch.zeros_like(scene.sh0).requires_grad_()
-            tensors = scene.tensors() | {"sh0": sh0, "shN": scene.shN[:, :0]}
-            tensors = {
-                name: tensor.clone() if tensor.is_inference() else tensor  # as autograd demands
-                for name, tensor in tensors.items()
-            }
-            gray = scene.with_tensors(tensors, {})
-            image = rasterize(gray, camera, sh_degree=0).rgb
-            (gradient,) = torch.autograd.grad(image[..., 0].sum(), sh0)
-        yield gradient[:, 0, 0].double().clamp_min(0.0) / SH_C0
+def without_gradients(scene: GaussianScene) -> GaussianScene:
+    """Return a scene to take gradients of something else through: constants that autograd takes.
+
+    Call it outside of inference mode.
+    """
+    tensors = {
+        name: tensor.clone() if tensor.is_inference() else tensor.detach()
+        for name, tensor in scene.tensors().items()
+    }
+    return scene.with_tensors(tensors, {})
 
 
-def observe_by_gradient(
+def observe_in_two_passes(
     rasterize: Callable[..., RasterOutput],
+    contributions: Callable[[GaussianScene, Cameras], Iterator[Tensor]],
     scene: GaussianScene,
     cameras: Cameras,
     *,
     sh_degree: int,
 ) -> Iterator[tuple[RasterOutput, Float[Tensor, "n"]]]:
     """Render images, and each once more for the contributions to it."""
-    found = contributions_by_gradient(rasterize, scene, cameras)
-    for camera, sums in zip(cameras.singles(), found, strict=True):
+    for camera, sums in zip(cameras.singles(), contributions(scene, cameras), strict=True):
         yield rasterize(scene, camera, sh_degree=sh_degree), sums
 
 

@@ -5,11 +5,13 @@ arithmetic (tests/gsplat_stand_in.py). One rule differs from 3DGS: alpha is limi
 of 0.99.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from importlib import import_module
+from itertools import chain
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
@@ -20,11 +22,14 @@ from cvtgs.rendering import torch_backend
 from cvtgs.rendering.backends import (
     STAGE,
     RasterOutput,
-    contributions_by_gradient,
-    observe_by_gradient,
+    observe_in_two_passes,
+    without_gradients,
 )
 from cvtgs.rendering.projection import DILATION, NEAR_PLANE, to_matrices
 from cvtgs.scene import GaussianScene
+
+TOGETHER = 1 << 22
+"""Largest number of Gaussians that are rendered at once, counted once for every camera."""
 
 PROBE_TOLERANCE = 0.02
 """Largest error of the probe's image and gradient, relative to their largest value.
@@ -59,17 +64,21 @@ def rasterize(
     sh_degree: int,
     listener: ProgressListener = silent,
 ) -> RasterOutput:
-    """Render all cameras at once with gsplat, in float32, if they treat tags and pixels alike.
+    """Render with gsplat, in float32, several cameras at once if they treat pixels alike.
 
-    Memory: that of gsplat, linear in cameras times Gaussians and in intersections.
+    Memory: that of gsplat for :data:`TOGETHER` Gaussians or one camera, and the images.
     """
     listener(ProgressEvent(stage=STAGE, done=0, total=len(cameras)))
     if len(scene) and len(cameras):
-        are_mixed = scene.antialiased and len(set(cameras.ignores_tag)) > 1
-        are_mixed = are_mixed or len(set(cameras.strides)) > 1
-        parts = cameras.singles() if are_mixed else [cameras]
-        found = [_rasterize_all(scene, part, sh_degree) for part in parts]
-        layers, alpha = (torch.cat(images) for images in zip(*found, strict=True))
+        rest = scene.shN[:, : REST_COUNTS[sh_degree]]
+        if sh_degree:
+            colors = torch.cat([scene.sh0, rest], dim=1)
+        else:
+            colors = evaluate(scene.sh0, rest, scene.means)
+        groups = _alike(scene, cameras)
+        parts = [cameras] if len(groups) == 1 else [cameras.select(rows) for rows in groups]
+        found = [_rasterize_all(scene, part, colors, sh_degree=sh_degree) for part in parts]
+        layers, alpha = (_in_order(images, groups) for images in zip(*found, strict=True))
     else:
         to_matrices(cameras)  # checks them
         layers = scene.means.new_zeros(len(cameras), cameras.height, cameras.width, 4)
@@ -79,18 +88,64 @@ def rasterize(
     return RasterOutput(rgb=layers[..., :3], depth=layers[..., 3], alpha=alpha[..., 0])
 
 
-contributions = partial(contributions_by_gradient, rasterize)
-observe = partial(observe_by_gradient, rasterize)
+def contributions(scene: GaussianScene, cameras: Cameras) -> Iterator[Float[Tensor, "n"]]:
+    """Yield contributions, as gradients of summed images with respect to a colour per camera.
+
+    Memory: as for images, with their gradients.
+    """
+    if len(scene) == 0 or len(cameras) == 0:
+        to_matrices(cameras)  # checks them
+        yield from scene.means.new_zeros(len(cameras), 0, dtype=torch.float64)
+        return
+    groups = _alike(scene, cameras)
+    if list(chain(*groups)) != list(range(len(cameras))):
+        groups = [[row] for row in range(len(cameras))]  # in order, and few are kept
+    for rows in groups:
+        part = cameras.select(rows)
+        with torch.inference_mode(mode=False), torch.enable_grad():
+            plain = without_gradients(scene)
+            shape = len(part), len(scene), 1
+            colors = plain.means.new_zeros(shape, dtype=torch.float32, requires_grad=True)
+            layers, _ = _rasterize_all(plain, part, colors, render_mode="RGB")
+            (gradient,) = torch.autograd.grad(layers.sum(), colors)
+        yield from gradient[:, :, 0].double().clamp_min(0.0)
+
+
+observe = partial(observe_in_two_passes, rasterize, contributions)
 blending_weights = torch_backend.blending_weights  # gsplat does not return them
 
 
-def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tuple[Tensor, Tensor]:
+def _alike(scene: GaussianScene, cameras: Cameras) -> list[list[int]]:
+    """Return groups of the row numbers of cameras that treat tags and pixels alike."""
+    alike: dict[tuple[int, bool], list[int]] = {}
+    for row in range(len(cameras)):
+        stride = cameras.strides[row] if cameras.strides else 1
+        ignores_tag = scene.antialiased and bool(cameras.ignores_tag) and cameras.ignores_tag[row]
+        alike.setdefault((stride, ignores_tag), []).append(row)
+    most = max(1, TOGETHER // len(scene))
+    return [
+        rows[start : start + most] for rows in alike.values() for start in range(0, len(rows), most)
+    ]
+
+
+def _in_order(parts: Sequence[Tensor], groups: Sequence[Sequence[int]]) -> Tensor:
+    """Return the images of groups of cameras in the order of the cameras."""
+    if len(parts) == 1:
+        return parts[0]
+    rows = list(chain(*groups))
+    images = list(chain(*(part.split(1) for part in parts)))
+    return torch.cat([images[place] for place in sorted(range(len(rows)), key=rows.__getitem__)])
+
+
+def _rasterize_all(
+    scene: GaussianScene,
+    cameras: Cameras,
+    colors: Tensor,
+    *,
+    sh_degree: int = 0,
+    render_mode: str = "RGB+D",
+) -> tuple[Tensor, Tensor]:
     """Return sums of colours and depths, and alpha; all cameras treat tags and pixels alike."""
-    rest = scene.shN[:, : REST_COUNTS[sh_degree]]
-    if sh_degree:
-        colors = torch.cat([scene.sh0, rest], dim=1)
-    else:
-        colors = evaluate(scene.sh0, rest, scene.means)
     means, viewmats, intrinsics = _about_cameras(scene, cameras)
     is_compensated = scene.antialiased and not any(cameras.ignores_tag)
     layers, alpha, _ = import_module("gsplat").rasterization(
@@ -107,7 +162,7 @@ def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tu
         eps2d=DILATION / max(cameras.strides, default=1) ** 2,
         sh_degree=sh_degree or None,
         packed=False,
-        render_mode="RGB+D",
+        render_mode=render_mode,
         rasterize_mode="antialiased" if is_compensated else "classic",
     )
     return layers, alpha

@@ -1,6 +1,6 @@
 """Differentiable rendering of scenes, and the contribution of each Gaussian to the images."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -150,11 +150,18 @@ def contributions(
         ((500,), True, True)
     """
     check_scene(scene)
-    chosen = choose_backend(backend, scene.device)[1]
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
-    for found in chosen.contributions(scene, checked_cameras(cameras)):
+    for found in contributions_to_each(scene, cameras, backend=backend):
         total += found
     return total
+
+
+def contributions_to_each(
+    scene: GaussianScene, cameras: Cameras, *, backend: BackendName = "auto"
+) -> Iterator[Float[Tensor, "n"]]:
+    """Yield what :func:`contributions` adds up: the contributions to every single image."""
+    chosen = choose_backend(backend, scene.device)[1]
+    return chosen.contributions(scene, checked_cameras(cameras))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

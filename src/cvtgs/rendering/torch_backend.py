@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 from cvtgs.cameras import Cameras
 from cvtgs.math import segments
 from cvtgs.math.parameters import MIN_ALPHA
+from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.rendering import backends
 from cvtgs.rendering.backends import PixelWeights, RasterOutput
@@ -76,8 +77,20 @@ def rasterize(
     return backends.collect_images(images, scene, cameras, listener=listener)
 
 
-contributions = partial(backends.contributions_by_gradient, rasterize)
-observe = partial(backends.observe_by_gradient, rasterize)
+def contributions(scene: GaussianScene, cameras: Cameras) -> Iterator[Float[Tensor, "n"]]:
+    """Yield contributions, as gradients of summed images with respect to the colours."""
+    for camera in cameras.singles():
+        with torch.inference_mode(mode=False), torch.enable_grad():
+            # Mid-grey, so that no colour is clipped; the higher SH bands do not matter here.
+            sh0 = torch.zeros_like(scene.sh0).requires_grad_()
+            tensors = backends.without_gradients(scene).tensors()
+            gray = scene.with_tensors(tensors | {"sh0": sh0, "shN": tensors["shN"][:, :0]}, {})
+            image = rasterize(gray, camera, sh_degree=0).rgb
+            (gradient,) = torch.autograd.grad(image[..., 0].sum(), sh0)
+        yield gradient[:, 0, 0].double().clamp_min(0.0) / SH_C0
+
+
+observe = partial(backends.observe_in_two_passes, rasterize, contributions)
 
 
 @torch.no_grad()

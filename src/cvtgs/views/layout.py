@@ -8,9 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.devices import HOST
 from cvtgs.errors import InvalidSceneError
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import divide
+from cvtgs.rendering.backends import choose_backend
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import valid_part, with_finite_opacities
 from cvtgs.views.up import VOXEL_SIZE, Voxels, among_others, find_floor, find_up, voxelize
@@ -79,7 +81,7 @@ def find_room(
     if hidden_share(best, points) > _HIDDEN:
         return None
     place = frame.center + frame.radius * best
-    if size_growth(sized, place, frame.radius, least_cells=_LEAST_CELLS) < _GROWS:
+    if size_growths(sized, place[None], frame.radius, least_cells=_LEAST_CELLS)[0] < _GROWS:
         return None
     eye: Tensor = center + (0.58 * (high - low) + low) * up
     return eye
@@ -114,30 +116,34 @@ def hidden_share(eye: Float[Tensor, "3"], points: Float[Tensor, "v 3"]) -> float
     return float((distances > _BEHIND * nearest[cells] + VOXEL_SIZE).double().mean())
 
 
-def size_growth(
-    sized: SizedPoints, eye: Float[Tensor, "3"], radius: float, *, least_cells: int = 1
-) -> float:
-    """Return the correlation of sizes with distances from a point, as a mean over directions.
+def size_growths(
+    sized: SizedPoints, eyes: Float[Tensor, "e 3"], radius: float, *, least_cells: int = 1
+) -> list[float]:
+    """Return the correlation of sizes with distances from points, as a mean over directions.
 
     It is 0 if fewer cells of directions than ``least_cells`` have enough Gaussians.
     """
-    offsets = sized.means - eye
-    distances = torch.linalg.vector_norm(offsets, dim=1)
+    offsets = sized.means - eyes[:, None]
+    distances = torch.linalg.vector_norm(offsets, dim=2)
     near = (distances < _FARTHEST * radius) & (distances > 0)
-    offsets, distances, sizes = offsets[near], distances[near].log(), sized.log_sizes[near]
-    cells = _cells_of_cube(offsets)
+    eye, row = near.nonzero(as_tuple=True)
+    offsets, distances, sizes = offsets[near], distances[near].log(), sized.log_sizes[row]
     count = 6 * _CELLS**2
-    numbers = torch.bincount(cells, minlength=count)
+    cells = eye * count + _cells_of_cube(offsets)
+    numbers = torch.bincount(cells, minlength=len(eyes) * count)
 
     def sums(values: Tensor) -> Tensor:
-        return torch.bincount(cells, weights=values, minlength=count)
+        return torch.bincount(cells, weights=values, minlength=len(eyes) * count)
 
     distances = distances - divide(sums(distances), numbers.double())[cells]
     sizes = sizes - divide(sums(sizes), numbers.double())[cells]
     products = (sums(distances.square()) * sums(sizes.square())).sqrt()
     correlations = divide(sums(distances * sizes), products)
     enough = (numbers >= _LEAST_IN_CELL) & (products > 0)
-    return float(correlations[enough].mean()) if int(enough.sum()) >= least_cells else 0.0
+    shape = len(eyes), count
+    of_eyes = zip(correlations.view(shape), enough.view(shape), strict=True)
+    some = [own[there] for own, there in of_eyes]
+    return [float(own.mean()) if len(own) >= least_cells else 0.0 for own in some]
 
 
 def _cells_of_cube(offsets: Float[Tensor, "n 3"]) -> Tensor:
@@ -171,6 +177,7 @@ class SceneLayout:
     """Position, extent and orientation of the content of a scene, float64, in scene units."""
 
     sample: GaussianScene  # covers the same area as the scene; SH degree 0, on the CPU
+    renders_on: torch.device  # where small images are rendered
     sized: SizedPoints
     frame: RobustFrame  # of the visible Gaussians
     voxels: Voxels  # the surfaces near the middle
@@ -227,6 +234,7 @@ def find_layout(scene: GaussianScene) -> SceneLayout:
     room = find_room(voxels, sized, frame, middle=middle, up=up)
     return SceneLayout(
         sample=sample,
+        renders_on=scene.device if choose_backend("auto", scene.device)[0] == "gsplat" else HOST,
         sized=sized,
         frame=frame,
         voxels=voxels,

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from operator import index
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.counts import check_whole, real_number
+from cvtgs.devices import HOST, in_chunks
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.text import shown
@@ -22,7 +24,7 @@ from cvtgs.views.layout import (
     enclosure,
     find_layout,
     level_axes,
-    size_growth,
+    size_growths,
     viewable_part,
 )
 from cvtgs.views.scoring import (
@@ -38,6 +40,7 @@ REACH = (0.2, 3.0)  # distances of candidate positions from the centre of the fr
 _SEEDS = 1 << 32
 _TRIED = 384
 _SEED = 17
+_EYES = 8  # positions per chunk
 _STANDING_REACH = (0.2, 2.0)  # level distances of candidates in an open place, robust radii
 _ELEVATIONS = (5.0, 35.0)  # angles at which these rise from the ground in the middle, degrees
 _ABOVE = 0.1  # least height above a floor, in robust radii
@@ -295,8 +298,11 @@ def _side_directions() -> Float[Tensor, "d 3"]:
 
 
 def _growths(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Float[Tensor, "c"]:
-    growths = [size_growth(layout.sized, eye, layout.frame.radius) for eye in eyes]
-    return torch.tensor(growths, dtype=torch.float64, device="cpu")
+    def growths_from(part: slice) -> list[float]:
+        return size_growths(layout.sized, eyes[part], layout.frame.radius)
+
+    growths = chain(*in_chunks(growths_from, len(eyes), _EYES, HOST))
+    return torch.tensor(list(growths), dtype=torch.float64, device="cpu")
 
 
 def split_by_clutter(
@@ -317,9 +323,11 @@ def split_by_clutter(
         return eyes, none  # the sample, which has larger splats, shows as much
     sample, enlargement = covering_sample(viewable_part(scene), _SAMPLE)
     widths = splat_widths(sample) * torch.exp(-enlargement[:, 0].double())
+    sample, widths = sample.to(layout.renders_on), widths.to(layout.renders_on)
     for most in _MEASURED:
         few = eyes[:: -(-len(eyes) // most)]
-        sizes = measure_splats(sample, widths, layout.frame.radius, _facing_middle(layout, few))
+        cameras = _facing_middle(layout, few)
+        sizes = measure_splats(sample, widths, layout.frame.radius, cameras)
         coarse = _are_coarse(sizes.finest, _LARGE)
         if coarse.double().mean() < _CLUTTERED:
             return eyes, none

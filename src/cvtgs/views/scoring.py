@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.devices import in_threads
+from cvtgs.devices import in_chunks
 from cvtgs.math import parameters
-from cvtgs.rendering import observe, render
+from cvtgs.rendering.render import contributions_to_each, render
 from cvtgs.scene import GaussianScene
 from cvtgs.views.layout import SceneLayout
 
@@ -27,6 +27,7 @@ of any number of Gaussians comparable."""
 
 _SPARSE = 4  # splats are measured on every fourth Gaussian of a sample, of four times the area
 _FEW = 20_000  # samples of fewer Gaussians are used whole
+_CAMERAS = 1  # cameras per chunk
 _ENCLOSING = 2.5  # a camera within this many standard deviations of a Gaussian is inside it
 
 
@@ -59,14 +60,15 @@ def score_cameras(
     hides its middle, or if too little of the image is filled.
     """
     small = cameras.fitted(PIXELS, least=8)
-    images = render(layout.sample, small, depth=True)
-    depth = images.alpha.new_zeros(()) if images.depth is None else images.depth
-    near = (images.alpha > _VISIBLE) & (depth < _NEAR * distances.to(depth)[:, None, None])
+    images = render(layout.sample.to(layout.renders_on), small, depth=True)
+    alpha = images.alpha.cpu()
+    depth = alpha.new_zeros(()) if images.depth is None else images.depth.cpu()
+    near = (alpha > _VISIBLE) & (depth < _NEAR * distances.to(depth)[:, None, None])
     near_share = near.double().mean(dim=(1, 2))
     rows, columns = (slice(side // 4, side - side // 4) for side in (small.height, small.width))
-    halfway = (images.alpha > _SOLID) & (depth < 0.45 * distances.to(depth)[:, None, None])
+    halfway = (alpha > _SOLID) & (depth < 0.45 * distances.to(depth)[:, None, None])
     blocked = halfway[:, rows, columns].double().mean(dim=(1, 2))
-    filled = images.alpha.double().mean(dim=(1, 2))
+    filled = alpha.double().mean(dim=(1, 2))
     lacking = (_LEAST_FILLED[layout.room is not None] - filled).clamp_min(0)
     enclosed = _inside_gaussians(layout, small)
     good = (near_share <= _MOST_NEAR) & (blocked <= _MOST_BLOCKED) & (lacking == 0) & ~enclosed
@@ -84,7 +86,7 @@ class SplatSizes(NamedTuple):
 def splat_sizes(layout: SceneLayout, cameras: Cameras) -> SplatSizes:
     """Return the median size of the splats that each camera shows, for at least one camera."""
     step = _SPARSE if len(layout.sample) >= _FEW else 1
-    sample = layout.sample[::step]
+    sample = layout.sample[::step].to(layout.renders_on)
     widths = splat_widths(sample)
     enlarged = sample.log_scales + 0.5 * math.log(step)
     sample = sample.with_tensors({"log_scales": enlarged}, {})
@@ -100,33 +102,37 @@ def measure_splats(
     scene: GaussianScene, widths: Float[Tensor, "n"], radius: float, cameras: Cameras
 ) -> SplatSizes:
     """Return the sizes of the splats that cameras show; ``widths`` need not be as drawn."""
-    means = scene.means.double()
+    painted = torch.stack(list(contributions_to_each(scene, cameras)))
+    means, (by_width, order) = scene.means.double(), widths.sort()
+    viewmats = cameras.viewmats.to(means)
 
-    def measure(camera: Cameras) -> Float[Tensor, "3"]:
-        painted = observe(scene, camera).contributions.double()
-        ahead = means @ camera.viewmats[0, 2, :3] + camera.viewmats[0, 2, 3]
-        seen = painted > 0
-        seen |= ~seen.any()  # an empty image shows no size
-        near = widths[seen] / ahead[seen].clamp_min(1e-9)
-        share_of_image = camera.Ks[0, 0, 0] / max(camera.width, camera.height)
+    def measure(part: slice) -> Float[Tensor, "c 3"]:
+        weights, forward = painted[part], viewmats[part, 2]
+        ahead = forward[:, :3] @ means.T + forward[:, 3:]
+        near, rows = (widths / ahead.clamp_min(1e-9)).sort(dim=1)
+        shares = weights[:, order].cpu().cumsum(dim=1)
         return torch.stack(
             [
-                _weighted_quantile(near, painted[seen], 0.5) * share_of_image,
-                _weighted_quantile(widths[seen], painted[seen], 0.5) / radius,
-                _weighted_quantile(widths[seen], painted[seen], 0.1) / radius,
-            ]
+                _weighted_quantile(near.cpu(), weights.gather(1, rows).cpu().cumsum(dim=1), 0.5),
+                _weighted_quantile(by_width.cpu().expand(shares.shape), shares, 0.5),
+                _weighted_quantile(by_width.cpu().expand(shares.shape), shares, 0.1),
+            ],
+            dim=1,
         )
 
-    sizes = torch.stack(list(in_threads(measure, cameras.singles(), scene.device)))
-    return SplatSizes(*sizes.unbind(1))
+    found = torch.cat(in_chunks(measure, len(cameras), _CAMERAS, scene.device))
+    share_of_image = cameras.Ks[:, 0, 0].double().cpu() / max(cameras.width, cameras.height)
+    in_image, in_scene, finest = found.unbind(1)
+    return SplatSizes(in_image * share_of_image, in_scene / radius, finest / radius)
 
 
 def _weighted_quantile(
-    values: Float[Tensor, "n"], weights: Float[Tensor, "n"], share: float
-) -> Tensor:
-    values, order = values.sort()
-    shares = weights[order].cumsum(dim=0)
-    return values[torch.searchsorted(shares, share * shares[-1])]
+    ascending: Float[Tensor, "c n"], summed: Float[Tensor, "c n"], share: float
+) -> Float[Tensor, "c"]:
+    """Return a quantile of every row of values, given the running sums of their weights."""
+    # Values of weight 0 are never found, unless all have: an empty image shows no size.
+    places = torch.searchsorted(summed, share * summed[:, -1:])
+    return ascending.gather(1, places)[:, 0]
 
 
 def _inside_gaussians(layout: SceneLayout, cameras: Cameras) -> Bool[Tensor, "c"]:
