@@ -29,6 +29,9 @@ CLOSE = 1e-5
 """Squared distances below this share of the squared reach of a tile are too close for float32,
 which is off by at most some 3e-7 of it; they are computed again in float64."""
 
+FEW = 1 / 16
+"""Groups of tiles of any kind may take this share of the longest: launches would cost more."""
+
 EXACT_COST = 8  # memory of an exact distance, in units of that of a fast one, rounded up
 SLACK = 1 + 1e-5  # bounds grow by this factor, against rounding of gaps between boxes
 
@@ -127,14 +130,14 @@ def tiles_of(
     last = len(points) - 1  # the last tile is filled with its own points, backwards
     fill = torch.where(fill > last, 2 * last + 1 - fill, fill).clamp_min(0).view(-1, size)
     points, bounds = points[fill], bounds[fill].amax(dim=1)
-    boxes = Boxes.around(points)
+    boxes, own = Boxes.around(points), homes[fill]
     reach = torch.linalg.vector_norm(boxes.high - boxes.low, dim=1) + bounds.sqrt()
     return Tiles(
         points=points,
         bounds=bounds,
         boxes=boxes,
-        first=homes[fill].amin(dim=1),
-        last=homes[fill].amax(dim=1),
+        first=own.amin(dim=1),
+        last=own.amax(dim=1),
         reach=reach.where(reach > 0, 1.0),
     )
 
@@ -147,23 +150,25 @@ def _candidates(tiles: Tiles, levels: Sequence[Boxes]) -> Candidates:
     device = tiles.points.device
     unit = tiles.bounds.median().sqrt()
     unit = torch.where((unit > 0) & unit.isfinite(), unit, tiles.reach.median())
-    ours, theirs = tiles.boxes.enlarged(unit), [boxes.enlarged(unit) for boxes in levels]
+    # Corners of tiles are swapped, so that a sum with those of a box is the gaps on either side.
+    axes = tiles.points.shape[2]
+    corners = [tiles.boxes.corners.roll(axes, dims=1), *(boxes.corners for boxes in levels)]
+    ours, *theirs = Boxes(torch.cat(corners)).enlarged(unit).corners.split(list(map(len, corners)))
     bounds = (tiles.bounds / unit.square() * SLACK).clamp(LEAST_GAP**2, 100 * LARGEST_GAP**2)
     bounds = bounds.where(tiles.bounds > 0, 0.0).float()
-    tile = torch.arange(len(bounds), device=device).repeat_interleave(len(theirs[0].low))
-    box = torch.arange(len(theirs[0].low), device=device).repeat(len(bounds))
+    tile, ends = torch.arange(len(ours), device=device), torch.stack([tiles.first, tiles.last])
+    box, children = torch.zeros_like(tile), torch.arange(1 << FAN_BITS, device=device)
     for number, boxes in enumerate(theirs):
-        if number:
-            children = torch.arange(1 << FAN_BITS, device=device)
-            tile = tile.repeat_interleave(1 << FAN_BITS)
-            box = ((box[:, None] << FAN_BITS) + children).flatten()
-        gaps = torch.maximum(boxes.low[box] - ours.high[tile], ours.low[tile] - boxes.high[box])
-        is_near = gaps.clamp_(0.0, LARGEST_GAP).square_().sum(1) < bounds[tile]
+        fan = 1 << FAN_BITS if number else len(boxes)
+        sides = boxes.view(-1, fan, 2 * axes)[box].add_(ours[tile, None])
+        gaps = torch.maximum(sides[:, :, :axes], sides[:, :, axes:])
+        is_near = gaps.clamp_(0.0, LARGEST_GAP).square_().sum(2) < bounds[tile, None]
+        box = torch.add(children[:fan], box[:, None], alpha=fan)
         # A nearest site on the bound itself lies in the leaf of its point.
-        shift = FAN_BITS * (len(levels) - 1 - number)
-        is_near |= (tiles.first[tile] >> shift <= box) & (box <= tiles.last[tile] >> shift)
-        kept = is_near.nonzero()[:, 0]
-        tile, box = tile[kept], box[kept]
+        first, last = (ends >> FAN_BITS * (len(theirs) - 1 - number))[:, tile, None]
+        is_near |= box.clamp(first, last) == box
+        parent, child = is_near.nonzero().unbind(1)
+        tile, box = tile[parent], box[parent, child]
     numbers = torch.bincount(tile, minlength=len(bounds))
     return Candidates(box, numbers.cumsum(0) - numbers, numbers)
 
@@ -174,73 +179,73 @@ def _nearest_of_tiles(
     """Return places in the leaves of the nearest sites of all points of the tiles, leaf by leaf."""
     candidates = _candidates(tiles, boxes)
     (_, side, _), (_, size) = tiles.points.shape, leaves.rows.shape
-    device, ranks_of = tiles.points.device, torch.arange(size, device=tiles.points.device)
-    found = torch.empty(*tiles.points.shape[:2], count, dtype=torch.int64, device=device)
+    device = tiles.points.device
     longest = chunk_length(DISTANCES, device) // (side * size * (EXACT_COST if is_exact else 1))
-    for group, most in _alike(candidates.numbers, longest):
-        first, numbers = (values[group, None] for values in candidates[1:])
-        ranks = torch.arange(most, device=device)
-        is_padding = ranks >= numbers
-        choice = candidates.leaves[torch.where(is_padding, first, first + ranks)]
+    negative, order = torch.sort(-candidates.numbers, stable=True)
+    groups = _alike(negative.tolist(), longest)
+    ranks = torch.arange(groups[0][1], device=device)
+    lists = torch.nn.functional.pad(candidates.leaves, (0, len(ranks)))  # for ranks beyond the end
+    starts, numbers = candidates.starts[order, None], candidates.numbers[order, None]
+    points, reach = tiles.points[order], tiles.reach[order, None, None]
+    if not is_exact:
+        middles = 0.5 * points.amin(1, keepdim=True) + 0.5 * points.amax(1, keepdim=True)
+        points = _factors(points.sub_(middles).div_(reach))
+    places = torch.empty(*points.shape[:2], count, dtype=torch.int64, device=device)
+    for group, most in groups:
+        choice = lists[starts[group] + ranks[:most]]
+        is_padding = ranks[:most] >= numbers[group]
         none = (leaves.is_filling[choice] | is_padding[:, :, None]).flatten(1)
-        points, sites = tiles.points[group], leaves.sites[choice].flatten(1, 2)
-        if is_exact:
-            distances = _exact_distances(points, sites).masked_fill_(none[:, None], torch.inf)
+        sites = leaves.sites[choice].flatten(1, 2)
+        if is_exact:  # of single points
+            distances = sites.sub_(points[group]).square_().sum(2).masked_fill_(none, torch.inf)
+            distances = distances[:, None]
         else:
-            distances = _fast_distances(points, sites, none, tiles.reach[group, None, None])
+            sites = sites.sub_(middles[group]).div_(reach[group])
+            distances = _fast_distances(points[group], sites, none)
         if count == 1:
-            places = distances.argmin(dim=2, keepdim=True)
+            torch.argmin(distances, dim=2, keepdim=True, out=places[group])
         else:
-            places = distances.topk(count, dim=2, largest=False).indices
-        rows = (choice[:, :, None] * size + ranks_of).flatten(1)
-        found[group] = rows.gather(1, places.flatten(1)).view(places.shape)
-    return found.view(-1, count)
+            places[group] = distances.topk(count, dim=2, largest=False).indices
+    rows = lists[(places // size).add_(starts[:, :, None])].mul_(size).add_(places.remainder_(size))
+    return places.index_copy_(0, order, rows).view(-1, count)
 
 
-def _alike(numbers: Int[Tensor, "g"], longest: int) -> Iterator[tuple[Int[Tensor, "h"], int]]:
-    """Group entries whose numbers differ by at most a factor of two; yield the largest number too.
+def _alike(negative: Sequence[int], longest: int) -> list[tuple[slice, int]]:
+    """Group entries whose numbers differ by at most a factor of two, or that are few together.
 
-    ``longest`` is the largest sum of numbers in a group of several.
+    Entries have descending numbers, given with a minus. ``longest`` is the largest sum of numbers,
+    with padding, in a group of several. The largest number of each group is returned as well.
     """
-    ascending, order = torch.sort(-numbers, stable=True)
-    negative: list[int] = ascending.tolist()
-    done = 0
+    groups, done = list[tuple[slice, int]](), 0
     while done < len(negative):
         most = -negative[done]
         alike = bisect_left(negative, -(most // 2), done) - done
-        step = max(1, min(alike, longest // most))
-        yield order[done : done + step], most
+        few = min(int(FEW * longest) // most, len(negative) - done)
+        step = max(1, min(max(alike, few), longest // most))
+        groups.append((slice(done, done + step), most))
         done += step
+    return groups
+
+
+def _factors(points: Float[Tensor, "g q d"]) -> Float[Tensor, "g q d_plus_1"]:
+    """Return the factors of points in the products of :func:`_fast_distances`."""
+    return torch.nn.functional.pad(points.float().mul_(-2.0), (0, 1), value=1.0)
 
 
 def _fast_distances(
-    points: Float[Tensor, "g q d"],
+    factors: Float[Tensor, "g q d_plus_1"],
     sites: Float[Tensor, "g c d"],
     none: Bool[Tensor, "g c"],
-    reach: Float[Tensor, "g 1 1"],
 ) -> Float[Tensor, "g q c"]:
     """Return squared distances less those of the points to the middle, in float32.
 
-    They are in units of the reach, and infinite where there is no site. Sites beyond the reach come
-    closer, but not within it.
+    Points and sites are relative to the middle, in units of the reach; distances are infinite where
+    there is no site. Sites beyond the reach come closer, but not within it.
     """
-    middle = 0.5 * points.amin(1, keepdim=True) + 0.5 * points.amax(1, keepdim=True)
-    sites = ((sites - middle) / reach).clamp_(-4.0, 4.0).float()
-    points = ((points - middle) / reach).float()
+    sites = sites.clamp_(-4.0, 4.0).float()
     norms = sites.square().sum(2).masked_fill_(none, torch.inf)
     # |s|^2 - 2 p s as one product of longer vectors: adding the norms would read all once more.
-    points = torch.nn.functional.pad(points.mul_(-2.0), (0, 1), value=1.0)
-    return torch.bmm(points, torch.cat([sites, norms[:, :, None]], dim=2).mT)
-
-
-def _exact_distances(
-    points: Float[Tensor, "g q d"], sites: Float[Tensor, "g c d"]
-) -> Float[Tensor, "g q c"]:
-    """Return squared distances in float64."""
-    total = points.new_zeros(*points.shape[:2], sites.shape[1])
-    for own, other in zip(points.unbind(2), sites.unbind(2), strict=True):
-        total += (own[:, :, None] - other[:, None]).square_()
-    return total
+    return torch.bmm(factors, torch.cat([sites, norms[:, :, None]], dim=2).mT)
 
 
 @contextmanager

@@ -12,25 +12,35 @@ FARTHEST = 1e37  # limit of coordinates in float32, in units
 
 
 class Boxes(NamedTuple):
-    """Boxes with axes along the coordinates."""
+    """Boxes with axes along the coordinates.
 
-    low: Float[Tensor, "k d"]  # smallest coordinates
-    high: Float[Tensor, "k d"]  # largest coordinates
+    Their largest coordinates are stored with the opposite sign, so that both are rounded downwards,
+    and a box around others has the smallest of both.
+    """
+
+    corners: Float[Tensor, "k two_d"]  # smallest coordinates, and the largest ones, negated
+
+    @property
+    def low(self) -> Float[Tensor, "k d"]:
+        """The smallest coordinates."""
+        return self.corners[:, : self.corners.shape[1] // 2]
+
+    @property
+    def high(self) -> Float[Tensor, "k d"]:
+        """The largest coordinates."""
+        return -self.corners[:, self.corners.shape[1] // 2 :]
 
     @classmethod
     def around(cls, points: Float[Tensor, "k p d"]) -> "Boxes":
         """Return the boxes around groups of points."""
-        return cls(points.amin(dim=1), points.amax(dim=1))
+        return cls(torch.cat([points.amin(dim=1), -points.amax(dim=1)], dim=1))
 
     def enlarged(self, unit: Float[Tensor, ""]) -> "Boxes":
         """Return boxes in float32 and in units, rounded outwards."""
-        low, high = ((corners / unit).clamp(-FARTHEST, FARTHEST) for corners in self)
-        inner = low.float(), high.float()
-        infinity = torch.full_like(inner[0], torch.inf)
-        return Boxes(
-            torch.where(inner[0] > low, inner[0].nextafter(-infinity), inner[0]),
-            torch.where(inner[1] < high, inner[1].nextafter(infinity), inner[1]),
-        )
+        exact = (self.corners / unit).clamp_(-FARTHEST, FARTHEST)
+        inner = exact.float()
+        below = inner.nextafter(torch.full_like(inner[0], -torch.inf))
+        return Boxes(torch.where(inner > exact, below, inner))
 
 
 class Leaves(NamedTuple):
@@ -54,12 +64,13 @@ def split_sites(sites: Float[Tensor, "m d"], most: int) -> Leaves:
     places, positions, splits = torch.arange(len(rows), device=device), sites[rows], []
     for level in range(height):
         parts = positions.view(2**level, -1, sites.shape[1])
-        axis = (parts.amax(dim=1) - parts.amin(dim=1)).argmax(dim=1)
+        least, largest = torch.aminmax(parts, dim=1)
+        axis = (largest - least).argmax(dim=1)
         keys = parts.gather(2, axis[:, None, None].expand(-1, parts.shape[1], 1))[:, :, 0]
         keys, ranks = torch.sort(keys, dim=1, stable=True)
         half = keys.shape[1] // 2
-        splits.append((axis, 0.5 * keys[:, half - 1] + 0.5 * keys[:, half]))
-        ranks += torch.arange(2**level, device=device)[:, None] * keys.shape[1]
+        splits.append((axis, (0.5 * keys[:, half - 1 : half + 1]).sum(dim=1)))
+        ranks += torch.arange(0, len(rows), keys.shape[1], device=device)[:, None]
         places, positions = places[ranks.flatten()], positions[ranks.flatten()]
     return Leaves(
         sites=positions.view(2**height, size, -1),
@@ -76,14 +87,13 @@ def home_leaves(
     boxes = torch.zeros(len(points), dtype=torch.int64, device=points.device)
     for axis, place in splits:
         values = points.gather(1, axis[boxes][:, None])[:, 0]
-        boxes = 2 * boxes + (values > place[boxes])
+        boxes = torch.add(values > place[boxes], boxes, alpha=2)
     return boxes
 
 
 def boxes_of(sites: Float[Tensor, "b s d"]) -> list[Boxes]:
     """Return the boxes of the tree, level by level from few large ones to the leaves."""
     levels = [Boxes.around(sites)]
-    while len(levels[0].low) > 1 << FAN_BITS:
-        low, high = (corners.unflatten(0, (-1, 1 << FAN_BITS)) for corners in levels[0])
-        levels.insert(0, Boxes(low.amin(dim=1), high.amax(dim=1)))
+    while len(levels[0].corners) > 1 << FAN_BITS:
+        levels.insert(0, Boxes(levels[0].corners.unflatten(0, (-1, 1 << FAN_BITS)).amin(dim=1)))
     return levels
