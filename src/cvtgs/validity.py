@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from cvtgs.devices import chunk_length
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError, warn
 from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
@@ -102,7 +103,9 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
             continue
         # Avoids a boolean array with an entry per value: a finite number times 0 is 0, any other
         # is NaN, and a sum with a NaN is NaN.
-        parts = values.flatten(start_dim=1).split(1 << 16)
+        flat = values.flatten(start_dim=1)
+        length = chunk_length(1 << 16, scene.device) // max(1, flat.shape[1])
+        parts = flat.split(max(1 << 16, length))
         masks[name] = torch.cat([(part * 0).sum(dim=1) != 0 for part in parts])
     masks["quats"] |= (scene.quats == 0).all(dim=1)
     if scene.dtype == torch.float64:
