@@ -4,9 +4,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-Pair = tuple[Tensor, Tensor]
-Three = tuple[Tensor, Tensor, Tensor]
-
 SWEEPS = 5
 """Rotations of all three planes. In float64, four leave only rounding errors; one is spare."""
 
@@ -29,31 +26,32 @@ def jacobi_eigen(
     matrices: Float[Tensor, "n 3 3"],
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Return what :func:`symmetric_eigen` does, by Jacobi rotations on any device."""
-    a, b, c = (matrices[:, k, k] for k in range(3))
-    ab, ac, bc = matrices[:, 1, 0], matrices[:, 2, 0], matrices[:, 2, 1]
-    x, y, z = torch.eye(3, dtype=a.dtype, device=a.device).expand(len(a), 3, 3).unbind(2)
+    diagonal = matrices.diagonal(dim1=1, dim2=2).T.clone(memory_format=torch.contiguous_format)
+    # Of each axis, twice the entry that the other two have in common, and its components.
+    others = torch.stack([matrices[:, 2, 1], matrices[:, 2, 0], matrices[:, 1, 0]])
+    unit = torch.eye(3, dtype=others.dtype, device=others.device)[:, :, None]
+    axes = torch.cat([2 * others[:, None], unit.expand(3, 3, len(matrices))], dim=1)
+    one, signs = others.new_ones(()), others.new_ones(2, 4, 1)
+    signs[0, 1:], signs[1, 0] = -1.0, -1.0
     for _ in range(SWEEPS):
-        (a, b), (ab, ac, bc), (x, y) = _rotated((a, b), (ab, ac, bc), (x, y))
-        (a, c), (ac, ab, bc), (x, z) = _rotated((a, c), (ac, ab, bc), (x, z))
-        (b, c), (bc, ab, ac), (y, z) = _rotated((b, c), (bc, ab, ac), (y, z))
-    values, order = torch.sort(torch.stack([a, b, c], dim=1), dim=1, stable=True)
-    axes = torch.stack([x, y, z], dim=2)
-    return values, axes.gather(2, order[:, None].expand(-1, 3, -1))
+        for planes, third in ((slice(0, 2), 2), (slice(0, 3, 2), 1), (slice(1, 3), 0)):
+            _rotate(diagonal[planes], axes[planes], axes[third, 0], one, signs)
+    values, order = torch.sort(diagonal.T, dim=1, stable=True)
+    return values, axes[:, 1:].permute(2, 1, 0).gather(2, order[:, None].expand(-1, 3, -1))
 
 
-def _rotated(diagonal: Pair, others: Three, axes: Pair) -> tuple[Pair, Three, Pair]:
+def _rotate(diagonal: Tensor, axes: Tensor, twice: Tensor, one: Tensor, signs: Tensor) -> None:
     """Rotate two axes so that their common entry becomes 0 (Golub and Van Loan 2013, 8.5.2).
 
-    ``others`` are the common entry and those that the axes have in common with the third one.
+    All are changed in place: the two diagonal entries, the axes, before each of which stands twice
+    the entry of the other one and the third, and ``twice`` the common entry. Those entries turn in
+    the opposite direction to the axes; ``signs`` are those of the tangent for all.
     """
-    (p, q), (pq, pr, qr), (x, y) = diagonal, others, axes
-    ratio = (q - p) / (2 * pq)
-    tangent = torch.copysign(1 / (ratio.abs() + torch.sqrt(ratio.square() + 1)), ratio)
-    tangent = torch.where(pq == 0, 0.0, tangent)
-    cosine = torch.rsqrt(tangent.square() + 1)
-    sine = tangent * cosine
-    shift = tangent * pq
-    pr, qr = cosine * pr - sine * qr, sine * pr + cosine * qr
-    cosine, sine = cosine[:, None], sine[:, None]
-    x, y = cosine * x - sine * y, sine * x + cosine * y
-    return (p - shift, q + shift), (torch.zeros_like(pq), pr, qr), (x, y)
+    step = diagonal[1] - diagonal[0]
+    length = torch.hypot(step, twice).clamp_min_(torch.finfo(step.dtype).tiny)
+    tangent = twice / length.copysign_(step).add_(step)
+    cosine = torch.addcmul(one, tangent, tangent).rsqrt_()
+    tangents = signs * tangent
+    diagonal.addcmul_(tangents[:, 1], twice, value=0.5)
+    twice.zero_()
+    axes.addcmul_(tangents, axes.flip(0)).mul_(cosine)
