@@ -23,6 +23,7 @@ TILE = 32
 """Points per tile. Larger tiles make longer matrices, but compare each point with more sites."""
 
 TILES = 1 << 12  # tiles per chunk of the descent, at the chunk length of a CPU
+PAIRS = 1 << 20  # of tiles and boxes, up to which levels of the tree are skipped
 DISTANCES = 1 << 22  # distances per matrix product, at the chunk length of a CPU
 
 CLOSE = 1e-5
@@ -110,7 +111,14 @@ def _squared(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], rows: Int[Tensor, "n k"]
 ) -> Float[Tensor, "n k"]:
     """Return the squared distances of points to some sites each."""
-    return torch.stack([(points - sites[column]).square().sum(1) for column in rows.T], dim=1)
+    step = max(1, chunk_length(DISTANCES, points.device) // (8 * points.numel()))
+    return torch.cat(
+        [
+            sites[columns].sub_(points[:, None]).square_().sum(2)
+            for columns in rows.split(step, dim=1)
+        ],
+        dim=1,
+    )
 
 
 def tiles_of(
@@ -150,6 +158,8 @@ def _candidates(tiles: Tiles, levels: Sequence[Boxes]) -> Candidates:
     device = tiles.points.device
     unit = tiles.bounds.median().sqrt()
     unit = torch.where((unit > 0) & unit.isfinite(), unit, tiles.reach.median())
+    while len(levels) > 1 and len(tiles.points) * len(levels[1].corners) <= PAIRS:
+        levels = levels[1:]
     # Corners of tiles are swapped, so that a sum with those of a box is the gaps on either side.
     axes = tiles.points.shape[2]
     corners = [tiles.boxes.corners.roll(axes, dims=1), *(boxes.corners for boxes in levels)]
@@ -157,13 +167,14 @@ def _candidates(tiles: Tiles, levels: Sequence[Boxes]) -> Candidates:
     bounds = (tiles.bounds / unit.square() * SLACK).clamp(LEAST_GAP**2, 100 * LARGEST_GAP**2)
     bounds = bounds.where(tiles.bounds > 0, 0.0).float()
     tile, ends = torch.arange(len(ours), device=device), torch.stack([tiles.first, tiles.last])
-    box, children = torch.zeros_like(tile), torch.arange(1 << FAN_BITS, device=device)
+    box, children = torch.zeros_like(tile), torch.arange(len(theirs[0]), device=device)
     for number, boxes in enumerate(theirs):
-        fan = 1 << FAN_BITS if number else len(boxes)
-        sides = boxes.view(-1, fan, 2 * axes)[box].add_(ours[tile, None])
+        if number == 1:
+            children = torch.arange(1 << FAN_BITS, device=device)
+        sides = boxes.view(-1, len(children), 2 * axes)[box].add_(ours[tile, None])
         gaps = torch.maximum(sides[:, :, :axes], sides[:, :, axes:])
         is_near = gaps.clamp_(0.0, LARGEST_GAP).square_().sum(2) < bounds[tile, None]
-        box = torch.add(children[:fan], box[:, None], alpha=fan)
+        box = torch.add(children, box[:, None], alpha=len(children))
         # A nearest site on the bound itself lies in the leaf of its point.
         first, last = (ends >> FAN_BITS * (len(theirs) - 1 - number))[:, tile, None]
         is_near |= box.clamp(first, last) == box

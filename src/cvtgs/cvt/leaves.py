@@ -69,9 +69,9 @@ def split_sites(sites: Float[Tensor, "m d"], most: int) -> Leaves:
         keys = parts.gather(2, axis[:, None, None].expand(-1, parts.shape[1], 1))[:, :, 0]
         keys, ranks = torch.sort(keys, dim=1, stable=True)
         half = keys.shape[1] // 2
-        splits.append((axis, (0.5 * keys[:, half - 1 : half + 1]).sum(dim=1)))
-        ranks += torch.arange(0, len(rows), keys.shape[1], device=device)[:, None]
-        places, positions = places[ranks.flatten()], positions[ranks.flatten()]
+        splits.append((axis, keys[:, half - 1 : half + 1].mean(dim=1)))
+        places = places.view(2**level, -1).gather(1, ranks).flatten()
+        positions = parts.gather(1, ranks[:, :, None].expand_as(parts)).flatten(0, 1)
     return Leaves(
         sites=positions.view(2**height, size, -1),
         rows=rows[places].view(-1, size),
