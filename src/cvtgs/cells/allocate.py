@@ -172,10 +172,8 @@ def _joint_covariances(
     """Return the covariances of pairs, given the share of the first group in the mass."""
     rest, shifts = 1.0 - share, one.means - two.means
     spread = share * rest * shifts
-    return torch.cat([
-        share * one.covariances[k] + rest * two.covariances[k] + spread[r] * shifts[c]
-        for k, (r, c) in enumerate(UPPER)
-    ])  # fmt: skip
+    products = torch.cat([spread[k] * shifts[k:] for k in range(3)])
+    return (share * one.covariances).add_(rest * two.covariances).add_(products)
 
 
 def _join_pairs(table: Float[Tensor, "c n"], first: Int[Tensor, "k"], second: Tensor) -> None:
@@ -220,23 +218,28 @@ def _cheapest_disjoint(
     """Take disjoint pairs, cheapest first, at most ``wanted``; return them in the order of pairs.
 
     Each round takes every pair that is the cheapest of both its groups. The result is that of a
-    greedy pass over all pairs by cost (Preis 1999), in a few vectorised rounds. Along chains of
-    ascending costs there would be as many rounds as pairs, so a loop finishes what is left.
+    greedy pass over all pairs by cost (Preis 1999), in a few vectorised rounds. Pairs that cost
+    more than ``wanted`` taken ones do not matter. Along chains of ascending costs there would be as
+    many rounds as pairs, so a loop finishes what is left.
     """
     # Bits of positive floats are in the order of the floats, so these keys are in that of costs.
     keys = costs.view(torch.int32).long() << ROW_BITS
     keys |= torch.arange(len(keys), device=keys.device)
     i, j, is_free = first, second, torch.ones(total, dtype=torch.bool, device=keys.device)
-    taken: list[Tensor] = []
+    taken, count = list[Tensor](), 0
     for _ in range(MOST_ROUNDS):
         least = torch.full((total,), torch.iinfo(torch.int64).max, device=keys.device)
         least.scatter_reduce_(0, i, keys, "amin").scatter_reduce_(0, j, keys, "amin")
         is_cheapest = (least.index_select(0, i) == keys) & (least.index_select(0, j) == keys)
         chosen = is_cheapest.nonzero()[:, 0]
         taken.append(keys.index_select(0, chosen))
-        is_free[i.index_select(0, chosen)] = False
-        is_free[j.index_select(0, chosen)] = False
-        left = (is_free.index_select(0, i) & is_free.index_select(0, j)).nonzero()[:, 0]
+        is_free.index_fill_(0, i.index_select(0, chosen), False)
+        is_free.index_fill_(0, j.index_select(0, chosen), False)
+        is_left = is_free.index_select(0, i) & is_free.index_select(0, j)
+        if count < wanted <= count + len(chosen):
+            is_left &= keys < torch.sort(torch.cat(taken)).values[wanted - 1]
+        count += len(chosen)
+        left = is_left.nonzero()[:, 0]
         i, j, keys = i.index_select(0, left), j.index_select(0, left), keys.index_select(0, left)
         if len(keys) == 0:
             break
@@ -294,7 +297,7 @@ def reassign(
     inverse, volumes = _inverse(groups.covariances)
     found = labels.new_empty(len(labels) + 1)  # the last is for groups without members
     own_costs = torch.empty(len(labels), dtype=torch.float64, device=labels.device)
-    tables = groups.means, groups.colors, inverse, volumes
+    tables = torch.cat([groups.means, groups.colors, volumes[None]]), inverse
 
     def search(part: slice) -> None:
         cells = labels[part]
@@ -302,7 +305,8 @@ def reassign(
         color = members.colors[:, part]
         least, best = None, cells
         for group in take_columns(cells, candidates)[0]:
-            center, tint, matrix, cost = take_columns(group, *tables)
+            values, matrix = take_columns(group, *tables)
+            center, tint, (cost,) = values.split([3, 3, 1])
             shifts = mean - center
             cost = cost + 2 * config.color * (color - tint).square().sum(0)
             for k, (r, c) in enumerate(UPPER):
