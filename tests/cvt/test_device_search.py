@@ -10,6 +10,12 @@ from cvtgs.cvt.nearest import nearest_several
 from pretended_device import pretended_cuda
 
 
+@pytest.fixture(autouse=True, params=[0, device_search.PAIRS], ids=["from the root", "deeper"])
+def start(request, monkeypatch):
+    """Search from the root of the tree, and from the level that a small scene starts at."""
+    monkeypatch.setattr(device_search, "PAIRS", request.param)
+
+
 def cloud(count, axes, seed=0):
     generator = torch.Generator().manual_seed(100 * count + seed)
     return torch.randn(count, axes, generator=generator, dtype=torch.float64)
@@ -92,6 +98,18 @@ def test_chunks_give_the_same(monkeypatch):
         assert torch.equal(found, same)
 
 
+def test_entries_of_like_numbers_or_few_together_share_a_group():
+    negative = [-100, -60, -50, -40, -9, -8, -3, -3, -1]
+    groups = device_search._alike(negative, longest=160)
+    assert groups == [
+        (slice(0, 1), 100), (slice(1, 3), 60), (slice(3, 4), 40), (slice(4, 6), 9),
+        (slice(6, 9), 3),
+    ]  # fmt: skip
+    assert device_search._alike([-5, -4, -3], longest=1) == [
+        (slice(0, 1), 5), (slice(1, 2), 4), (slice(2, 3), 3),
+    ]  # fmt: skip
+
+
 def test_fewer_bits_of_matrix_products_are_not_used():
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("medium")
@@ -110,7 +128,7 @@ def test_a_search_on_the_device_stays_there():
         traffic.copies.clear()
         _, squared = nearest_in_tiles(*there, 3)
         assert not traffic.copies
-        assert traffic.waits.total() <= 12, traffic.waits
+        assert traffic.waits.total() <= 9, traffic.waits
         torch.testing.assert_close(squared.cpu().sqrt(), smallest(points, sites, 3))
 
 

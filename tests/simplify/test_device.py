@@ -18,10 +18,10 @@ from pretended_device import CUDA, DeviceTensor, pretended_cuda
 from scenes import random_scene, same_bits
 
 PRESETS = ["draft", "fast", "standard", "paper"]
-WAITS, COPIES = 160, 3
+WAITS, COPIES = 120, 3
 """Largest numbers of host waits and of copies in one simplification.
 
-Most waits are for the sizes of lists: each search for nearest sites waits 10 to 20 times, each
+Most waits are for the sizes of lists: each search for nearest sites waits 5 to 15 times, each
 round of merging pairs 3 times. One copy is for the network; a scene outside the device adds 6.
 Neither number grows with the scene, except by chunks, which are large on a device, and by the
 depth of the tree of sites.

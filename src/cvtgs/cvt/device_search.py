@@ -180,8 +180,8 @@ def _candidates(tiles: Tiles, levels: Sequence[Boxes]) -> Candidates:
         is_near |= box.clamp(first, last) == box
         parent, child = is_near.nonzero().unbind(1)
         tile, box = tile[parent], box[parent, child]
-    numbers = torch.bincount(tile, minlength=len(bounds))
-    return Candidates(box, numbers.cumsum(0) - numbers, numbers)
+    edges = torch.searchsorted(tile, torch.arange(len(ours) + 1, device=device))
+    return Candidates(box, edges[:-1], edges.diff())
 
 
 def _nearest_of_tiles(
