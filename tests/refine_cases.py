@@ -8,6 +8,7 @@ import cvtgs
 from cvtgs import GaussianScene
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.refinement import RefineConfig
+from cvtgs.refinement.images import RefineViews
 
 
 def quick(**changes: Any) -> RefineConfig:
@@ -43,3 +44,7 @@ def ring(count: int = 4, *, width: int = 32, height: int = 24, distance: float =
     return Cameras(
         viewmats=viewmats, Ks=torch.tensor(rows).repeat(count, 1, 1), width=width, height=height
     )
+
+
+def three_views(*, endless: bool = False) -> RefineViews:
+    return RefineViews(heldout=(), training=iter(ring(3).singles()), endless=endless)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Self
 
 import torch
@@ -13,7 +14,7 @@ from cvtgs.checks import check_kinds, checked
 from cvtgs.counts import check_whole, whole_number
 from cvtgs.devices import usable_device, without_autocast
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.selection import row_numbers
+from cvtgs.selection import row_numbers, spread_rows
 from cvtgs.text import shown
 
 
@@ -317,6 +318,20 @@ class Cameras:
         return self.select(spread_rows(len(self), count))
 
 
+def join_cameras(parts: Sequence[Cameras]) -> Cameras:
+    """Return cameras of one image size together, without names."""
+    strides = [part.strides or (1,) * len(part) for part in parts]
+    modes = [part.ignores_tag or (False,) * len(part) for part in parts]
+    return Cameras(
+        viewmats=torch.cat([part.viewmats for part in parts]),
+        Ks=torch.cat([part.Ks for part in parts]),
+        width=parts[0].width,
+        height=parts[0].height,
+        strides=tuple(chain(*strides)) if any(part.strides for part in parts) else (),
+        ignores_tag=tuple(chain(*modes)) if any(part.ignores_tag for part in parts) else (),
+    )
+
+
 def checked_cameras(cameras: object) -> Cameras:
     """Return cameras unchanged; raise for anything else."""
     if not isinstance(cameras, Cameras):
@@ -331,12 +346,6 @@ def view_scales(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "c"]:
     """Return the uniform scale of each view matrix; exactly 1 for rotations up to rounding."""
     scales = viewmats[:, :3, :3].square().sum(dim=(1, 2)).div(3).sqrt()
     return torch.where((scales - 1).abs() > 1e-3, scales, 1.0)
-
-
-def spread_rows(length: int, count: int) -> tuple[int, ...]:
-    """Return ``count`` evenly spaced row numbers below a length, or all if it is shorter."""
-    count = min(count, length)
-    return tuple((k * length) // count for k in range(count))
 
 
 @without_autocast()

@@ -43,7 +43,11 @@ def l1_loss(
         0.25
     """
     check_pair(prediction, target)
-    return (prediction - target).abs().mean()
+    return _l1(prediction, target).mean()
+
+
+def _l1(prediction: Tensor, target: Tensor) -> Float[Tensor, "c"]:
+    return (prediction - target).abs().mean(dim=(1, 2, 3))
 
 
 def ssim_loss(
@@ -71,7 +75,6 @@ def ssim_loss(
     return 1 - mean_ssim(prediction, target).mean()
 
 
-@without_autocast()  # variances are small differences of large means
 def mean_ssim(
     prediction: Float[Tensor, "c h w 3"], target: Float[Tensor, "c h w 3"]
 ) -> Float[Tensor, "c"]:
@@ -83,6 +86,11 @@ def mean_ssim(
     of one stack of images, 30 with the gradient.
     """
     check_pair(prediction, target, least=SSIM_WINDOW)
+    return _ssim(prediction, target)
+
+
+@without_autocast()  # variances are small differences of large means
+def _ssim(prediction: Tensor, target: Tensor) -> Float[Tensor, "c"]:
     from kornia.filters import filter2d_separable  # noqa: PLC0415 (slow)
 
     x, y = (images.permute(0, 3, 1, 2) for images in (prediction, target))
@@ -134,13 +142,17 @@ def gradient_loss(
         0.5
     """
     check_pair(prediction, target)
+    return _gradient(prediction, target).mean()
+
+
+def _gradient(prediction: Tensor, target: Tensor) -> Float[Tensor, "c"]:
     difference = prediction - target
     return _mean_step(difference, 2) + _mean_step(difference, 1)
 
 
-def _mean_step(difference: Float[Tensor, "c h w 3"], axis: int) -> Float[Tensor, ""]:
+def _mean_step(difference: Float[Tensor, "c h w 3"], axis: int) -> Float[Tensor, "c"]:
     steps = difference.diff(dim=axis).abs()
-    return steps.sum() / max(steps.numel(), 1)
+    return steps.sum(dim=(1, 2, 3)) / max(steps[0].numel(), 1)
 
 
 def image_loss(
@@ -180,8 +192,9 @@ def image_loss(
         raise InvalidArgumentError(
             f"gradient_weight must be a finite number of at least 0, found {gradient_weight!r}."
         )
-    dissimilarity = ssim_loss(prediction, target) if ssim_weight else 0.0
-    return _image_loss(prediction, target, dissimilarity, ssim_weight, gradient_weight)
+    check_pair(prediction, target, least=SSIM_WINDOW if ssim_weight else 1)
+    dissimilarity = 1 - _ssim(prediction, target) if ssim_weight else 0.0
+    return _image_loss(prediction, target, dissimilarity, ssim_weight, gradient_weight).mean()
 
 
 def relative_loss(
@@ -192,7 +205,7 @@ def relative_loss(
     image_weight: float = 0.5,
     ssim_weight: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """Return ``w_s log(mse) + w_i log(image_loss) + w_d log(1 - SSIM)``.
+    """Return the mean over images of ``w_s log(mse) + w_i log(image_loss) + w_d log(1 - SSIM)``.
 
     A gain in PSNR lowers it by the same amount whether the images are good or poor, until the
     floors count: 1e-5 is added to the mse and 1e-3 to the others. A term of weight 0 is not
@@ -218,20 +231,21 @@ def relative_loss(
         >>> round(relative_loss(grey, white, image_weight=0.0).item(), 3)
         -0.693
     """
-    check_pair(prediction, target)
-    loss = prediction.new_zeros(())
+    uses_ssim = bool(image_weight or ssim_weight)
+    check_pair(prediction, target, least=SSIM_WINDOW if uses_ssim else 1)
+    loss = prediction.new_zeros(len(prediction))
     if squared_weight:
-        squared = (prediction - target).square().mean()
+        squared = (prediction - target).square().mean(dim=(1, 2, 3))
         loss = loss + squared_weight * positive_log(squared + SQUARED_FLOOR)
-    if not image_weight and not ssim_weight:
-        return loss
-    dissimilarity = ssim_loss(prediction, target)  # once: it takes longest
+    if not uses_ssim:
+        return loss.mean()
+    dissimilarity = 1 - _ssim(prediction, target)  # once: it takes longest
     if image_weight:
         image = _image_loss(prediction, target, dissimilarity, SSIM_WEIGHT, GRADIENT_WEIGHT)
         loss = loss + image_weight * positive_log(image + IMAGE_FLOOR)
     if ssim_weight:
         loss = loss + ssim_weight * positive_log(dissimilarity + IMAGE_FLOOR)
-    return loss
+    return loss.mean()
 
 
 def _image_loss(
@@ -240,10 +254,10 @@ def _image_loss(
     dissimilarity: Tensor | float,
     ssim_weight: float,
     gradient_weight: float,
-) -> Float[Tensor, ""]:
-    loss = (1 - ssim_weight) * l1_loss(prediction, target) + ssim_weight * dissimilarity
+) -> Float[Tensor, "c"]:
+    loss = (1 - ssim_weight) * _l1(prediction, target) + ssim_weight * dissimilarity
     if gradient_weight:
-        loss = loss + gradient_weight * gradient_loss(prediction, target)
+        loss = loss + gradient_weight * _gradient(prediction, target)
     return loss
 
 

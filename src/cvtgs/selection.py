@@ -11,6 +11,12 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.text import shown
 
 
+def spread_rows(length: int, count: int) -> tuple[int, ...]:
+    """Return ``count`` evenly spaced row numbers below a length, or all if it is shorter."""
+    count = min(count, length)
+    return tuple((k * length) // count for k in range(count))
+
+
 def row_numbers(
     rows: slice | Sequence[int] | Tensor, count: int, *, things: str, device: torch.device
 ) -> Int[Tensor, "m"]:

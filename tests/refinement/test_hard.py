@@ -207,7 +207,8 @@ def test_an_empty_background_stays_nearly_empty():
 def test_random_backgrounds_take_black_paint_from_an_empty_background(monkeypatch):
     """Over black alone, black opaque Gaussians cost nothing."""
     full, small, refined = refined_beside_nothing(stray=20)
-    monkeypatch.setattr(ImageBuffer, "draw_background", lambda self: 0.0 * self._full.means[0])
+    black = lambda self, count: self._full.means.new_zeros(count, 3)  # noqa: E731
+    monkeypatch.setattr(ImageBuffer, "draw_backgrounds", black)
     _, _, over_black = refined_beside_nothing(stray=20)
     (_, before, after, black), empty = alphas_of(full, small, refined, over_black)
     assert after[empty].mean() < 0.95 * black[empty].mean()

@@ -20,7 +20,7 @@ from cvtgs.refinement.images import ImageBuffer, RefineViews, generated_views, s
 from cvtgs.refinement.optimize import Limits, SceneOptimizer, heldout_psnr, psnr_cap, step_factor
 from cvtgs.refinement.refine import changed_count
 from cvtgs.rendering import observe
-from refine_cases import full_scene, quick, ring
+from refine_cases import full_scene, quick, ring, three_views
 from scenes import random_scene, same_bits
 
 
@@ -176,12 +176,6 @@ def test_the_psnr_of_a_far_better_view_is_capped():
     assert psnr_cap(torch.tensor([55.0, 58.0])) == 60
 
 
-def three_views(*, endless: bool = False) -> RefineViews:
-    cameras = ring(3)
-    singles = [cameras.select(torch.tensor([row])) for row in range(3)]
-    return RefineViews(heldout=(), training=iter(singles), endless=endless)
-
-
 @pytest.mark.parametrize("endless", [False, True])
 def test_images_are_rendered_when_needed_and_reused(endless):
     full = full_scene(50)
@@ -297,15 +291,6 @@ def test_images_that_are_never_used_again_are_not_kept():
     first, second = weakref.ref(images.draw().rgb), images.draw()
     assert first() is None
     assert second.rgb.shape == (1, 24, 32, 3)
-
-
-def test_backgrounds_are_random_and_seeded():
-    full = full_scene(50)
-    buffers = [ImageBuffer(full, three_views(), config=quick(), seed=seed) for seed in (0, 0, 1)]
-    first, again, other = (images.draw_background() for images in buffers)
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
-    assert 0 <= float(first.amin()) <= float(first.amax()) <= 1
 
 
 def test_a_step_is_the_rate_times_the_scale_of_the_gaussian():

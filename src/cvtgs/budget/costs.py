@@ -116,7 +116,7 @@ class Work:
         new_images = refine.new_images(refine.steps, given=learned)
         batches = math.ceil(new_images / refine.batch) + (not shared)
         checks = 1 + math.ceil(refine.steps / refine.check_every)
-        renders = refine.steps + SHARE_OF_A_STEP * heldout * checks
+        renders = refine.steps * refine.images_per_step + SHARE_OF_A_STEP * heldout * checks
         renders += STEPS_OF_A_BATCH * batches
         side = visibility.size / visibility.stride
         amounts = {

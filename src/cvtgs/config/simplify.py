@@ -45,13 +45,22 @@ MATCHED: Mapping[str, Any] = {
 }
 
 THINNED: Mapping[str, Any] = {
-    "steps": 480,
+    "steps": 120,
+    "images_per_step": 4,
+    "rates": {
+        "means": 0.08,
+        "quats": 0.032,
+        "log_scales": 0.04,
+        "logit_opacities": 0.2,
+        "sh0": 0.08,
+        "shN": 0.004,
+    },
     "half_after": 115,
     "cooling": 0.3,
     **IMAGES,
     "first_images": 32,
     "steps_per_image": 1000,
-    "check_every": 50,
+    "check_every": 15,
 }
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {

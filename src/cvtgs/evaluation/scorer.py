@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.cameras import Cameras
+from cvtgs.cameras import Cameras, join_cameras
 from cvtgs.config.base import Record
 from cvtgs.errors import CvtgsError, InvalidArgumentError
 from cvtgs.evaluation.lpips import LEAST_PIXELS, LpipsNetwork, LpipsWeights, load_lpips, lpips
@@ -182,10 +182,23 @@ class ViewImages:
     rgb: Float[Tensor, "c h w 3"]
     alpha: Float[Tensor, "c h w"]
 
-    def over(self, background: Float[Tensor, "3"]) -> Float[Tensor, "c h w 3"]:
+    @classmethod
+    def joined(cls, images: Sequence[Self]) -> Self:
+        """Return images of one size together."""
+        if len(images) == 1:
+            return images[0]
+        return cls(
+            cameras=join_cameras([one.cameras for one in images]),
+            rgb=torch.cat([one.rgb for one in images]),
+            alpha=torch.cat([one.alpha for one in images]),
+        )
+
+    def over(
+        self, background: Float[Tensor, "3"] | Float[Tensor, "c 3"]
+    ) -> Float[Tensor, "c h w 3"]:
         """Composite the images over a background, in the dtype of the background."""
         rgb, alpha = self.rgb.to(background.dtype), self.alpha.to(background.dtype)
-        return rgb + (1 - alpha)[..., None] * background
+        return rgb + (1 - alpha)[..., None] * background.view(-1, 1, 1, 3)
 
     def every(self, stride: int, *, first: tuple[int, int]) -> Self:
         """Return every ``stride``-th pixel, starting at a first column and row."""

@@ -107,7 +107,8 @@ def _choose_views(job: Job, drawn: Drawn) -> tuple[Cameras | None, Cameras | Non
         views = make(config.visibility.views, size=config.visibility.size, seed=seed)
         views = visibility_cameras(members, config, cameras=views)
     if refines:
-        number = min(config.refine.images, config.refine.steps) + config.refine.heldout
+        used = config.refine.steps * config.refine.images_per_step
+        number = min(config.refine.images, used) + config.refine.heldout
         later = make(max(2, number), size=config.refine.size, seed=seed + LATER_SEED)
     return views, later
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import count
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -127,8 +128,8 @@ class ImageBuffer:
     A reused image is drawn at random from the least recently used half of the buffer. A step sees
     every ``config.stride``-th pixel, with a random first one.
 
-    Memory: 8 bytes per pixel of at most ``config.images`` images, or of one image if every step
-    renders a new one.
+    Memory: 8 bytes per pixel of at most ``config.images`` images, or of one image if all are new,
+    and as much for the images of a step.
     """
 
     def __init__(
@@ -144,6 +145,14 @@ class ImageBuffer:
         self._kept = [(image, 1) for image in views.images]  # with what is left of the stride
         self._drawn = len(self._kept)
         self.rendered = 0
+
+    def draw_step(self) -> list[ViewImages]:
+        """Return the training images of a step, those of one size together."""
+        groups: dict[tuple[int, ...], list[ViewImages]] = {}
+        for _ in range(self._config.images_per_step):
+            image = self.draw()
+            groups.setdefault(image.rgb.shape, []).append(image)
+        return [ViewImages.joined(group) for group in groups.values()]
 
     def draw(self) -> ViewImages:
         """Return a training image, in half precision."""
@@ -165,6 +174,8 @@ class ImageBuffer:
         first = (self._rng.randrange(stride), self._rng.randrange(stride))
         return image.every(stride, first=first)
 
-    def draw_background(self) -> Float[Tensor, "3"]:
-        """Return a random color."""
-        return self._full.means.new_tensor([self._rng.random() for _ in range(3)])
+    def draw_backgrounds(self, count: int) -> Float[Tensor, "c 3"]:
+        """Return a random color for each of some images."""
+        rows = [[self._rng.random() for _ in range(3)] for _ in range(count)]
+        colors = torch.tensor(rows, dtype=self._full.dtype, device="cpu")
+        return colors.to(self._full.device, non_blocking=True)

@@ -115,7 +115,7 @@ def optimize(
     learning_rate_scale: Float[Tensor, "n"],
     listener: ProgressListener,
 ) -> Optimized:
-    """Fit the Gaussians of a scene to images of the full one, one image per step."""
+    """Fit the Gaussians of a scene to images of the full one, some images per step."""
     limits.begin()
     first = heldout_psnr(small, scorer)
     cap = psnr_cap(first)
@@ -127,16 +127,7 @@ def optimize(
     while not stopped:
         factor = step_factor(limits, config)
         limits.begin()
-        # A random background, because a wrong opacity is visible over some colors.
-        target, background = images.draw(), images.draw_background()
-        image = render(optimizer.scene(), target.cameras, background=background).rgb
-        loss = relative_loss(
-            image,
-            target.over(background),
-            squared_weight=config.mse_weight,
-            image_weight=config.image_weight,
-        )
-        optimizer.step(loss, factor=factor)
+        optimizer.step(mean_loss(optimizer.scene(), images, config), factor=factor)
         limits.end("step")
         stopped = limits.reached()
         if stopped or limits.steps % config.check_every == 0:
@@ -153,6 +144,23 @@ def optimize(
         note = f"{after - before:+.2f} dB"
         listener(ProgressEvent(stage=STAGE, done=limits.done, total=limits.total, note=note))
     return Optimized(scene=best, before=before, after=after, stopped=stopped)
+
+
+def mean_loss(scene: GaussianScene, images: ImageBuffer, config: RefineConfig) -> Tensor:
+    """Return the mean loss of a scene in the images of one step."""
+    loss = scene.means.new_zeros(())
+    for targets in images.draw_step():
+        # Random backgrounds, because a wrong opacity is visible over some colors.
+        backgrounds = images.draw_backgrounds(len(targets.rgb))
+        image = render(scene, targets.cameras, background=backgrounds).rgb
+        part = relative_loss(
+            image,
+            targets.over(backgrounds),
+            squared_weight=config.mse_weight,
+            image_weight=config.image_weight,
+        )
+        loss = loss + part * (len(targets.rgb) / config.images_per_step)
+    return loss
 
 
 def step_factor(limits: Limits, config: RefineConfig) -> float:
@@ -240,7 +248,9 @@ class SceneOptimizer:
             _moved_average(values, rows, new, beta)
             for values, new, beta in zip(self._moments, (some, some.square()), _BETAS, strict=True)
         )
-        change = means.div_(squares.sqrt_().add_(_LEAST_ROOT)).mul_(-gradient.new_tensor(lengths))
+        steps = torch.tensor(lengths, dtype=gradient.dtype, device="cpu").neg_()
+        steps = steps.to(gradient.device, non_blocking=True)
+        change = means.div_(squares.sqrt_().add_(_LEAST_ROOT)).mul_(steps)
         values = self._changes.detach()
         values.index_copy_(0, rows, change.add_(values.index_select(0, rows)))
         self._moved[rows] = True

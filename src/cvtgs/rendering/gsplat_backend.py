@@ -178,7 +178,8 @@ def _about_cameras(scene: GaussianScene, cameras: Cameras) -> tuple[Tensor, Tens
     rotations, count = viewmats[:, :3, :3], len(cameras)
     middle = -(rotations.mT @ viewmats[:, :3, 3:]).mean(dim=0)[:, 0]
     viewmats[:, :3, 3] += rotations @ middle
-    table = torch.cat([middle, viewmats.flatten(), intrinsics.flatten()]).to(scene.device)
+    table = torch.cat([middle, viewmats.flatten(), intrinsics.flatten()])
+    table = table.to(scene.device, non_blocking=True)  # or the host would wait for earlier images
     middle, viewmats, intrinsics = table.split([3, 16 * count, 9 * count])
     means = scene.means.double() - middle
     return means, viewmats.float().view(-1, 4, 4), intrinsics.float().view(-1, 3, 3)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.cameras import Cameras, look_at
+from cvtgs.cameras import Cameras, join_cameras, look_at
 from cvtgs.counts import check_whole
 from cvtgs.scene import SceneLike
 from cvtgs.views.automatic import automatic_views
@@ -151,12 +151,7 @@ def mixed_views(
     ]
     tried = [(cameras, wanted) for cameras, wanted in tried if wanted]
     groups = _sharp_ones(positions, tried) if sharp else [cameras for cameras, _ in tried]
-    return Cameras(
-        viewmats=torch.cat([group.viewmats for group in groups]),
-        Ks=torch.cat([group.Ks for group in groups]),
-        width=size,
-        height=size,
-    )
+    return join_cameras(groups)
 
 
 def _sharp_ones(positions: CameraPositions, tried: Sequence[tuple[Cameras, int]]) -> list[Cameras]:
