@@ -30,6 +30,7 @@ from cvtgs.views import automatic_views
 
 PAGE = Path("docs/gpu.md")
 COUNTS = (1_000_000, 4_200_000, 13_600_000)
+COLORED = (1_000_000, 4_200_000)  # counts of the scenes with view-dependent colour
 IMAGE_PRESETS: tuple[dict[str, Any], ...] = ({"preset": "matched"}, {"preset": "high"})
 """The configurations that render the scene."""
 
@@ -48,6 +49,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="Gaussians")
+    parser.add_argument("--colored", type=int, nargs="*", default=COLORED, help="with SH degree 3")
     parser.add_argument("--rho", type=float, default=0.01)
     parser.add_argument("--runs", type=int, default=3, help="measured runs, after one warm-up")
     parser.add_argument("--size", type=int, default=400, help="pixels along both edges")
@@ -61,6 +63,7 @@ def main() -> None:
             f"{cvtgs.__version__}.\n",
             *stage_table(device, options.counts, rho=options.rho, runs=options.runs),
             *files_table(device, options.counts, rho=options.rho, runs=options.runs),
+            *color_table(device, options.colored, rho=options.rho, runs=options.runs),
             *preset_table(device, options.counts[0], rho=options.rho),
             *renderer_table(device, options.counts[0], size=options.size, runs=options.runs),
             *training_table(device, steps=options.steps),
@@ -129,6 +132,25 @@ def files_table(device: torch.device, counts: Sequence[int], *, rho: float, runs
                 times.append((loaded - start, simplified - loaded, end - simplified, end - start))
         medians = [statistics.median(column) for column in zip(*times[1:], strict=True)]
         lines.append(f"| {count:,} | " + " | ".join(f"{one:.2f}" for one in medians) + " |")
+    return [*lines, ""]
+
+
+def color_table(device: torch.device, counts: Sequence[int], *, rho: float, runs: int) -> list[str]:
+    """Return a table of median seconds of whole calls for scenes with view-dependent colour."""
+    lines = [
+        "| Gaussians, SH 3 | copy s | simplify on the device s | peak on the device MB | CPU s |",
+        "|---|---|---|---|---|",
+    ]
+    for count in counts:
+        scene = cvtgs.synthetic.scene("courtyard", count, sh_degree=3, seed=0)
+        copy = statistics.median([seconds(partial(scene.to, device), device) for _ in range(runs)])
+        _, reports = repeat(scene.to(device), SimplifyConfig(), rho, device=device, runs=runs)
+        report = Simplifier(device="cpu").run(scene, rho).report
+        median = statistics.median(one.seconds for one in reports)
+        stages = (stage for one in reports for stage in one.stages)
+        peak = max(stage.peak_device_memory_bytes for stage in stages) / 1e6
+        line = f"| {count:,} | {copy:.3f} | {median:.3f} | {peak:.0f} | {report.seconds:.2f} |"
+        lines.append(line)
     return [*lines, ""]
 
 
