@@ -13,7 +13,7 @@ import gsplat_stand_in
 from cvtgs import GaussianScene
 from cvtgs.cameras import Cameras
 from cvtgs.errors import MissingDependencyError
-from cvtgs.rendering import choose_backend, gsplat_backend, projection, render
+from cvtgs.rendering import choose_backend, gsplat_backend, observe, projection, render
 from cvtgs.rendering.render import contributions_to_each
 from render_cases import MIP, around, oracle_images, scene_of, straight
 from scenes import random_scene
@@ -217,6 +217,23 @@ def test_contributions_to_each_image(install, monkeypatch, mode, together):
         wanted = torch.stack(list(contributions_to_each(scene, cameras, backend="torch")))
         assert found.shape == (3, 20)
         torch.testing.assert_close(found.clone(), wanted, rtol=1e-4, atol=1e-2)
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.parametrize("mode", [torch.enable_grad, torch.inference_mode])
+def test_images_and_contributions_in_one_pass(install, mode, degree):
+    install(gsplat_stand_in.rasterization)
+    scene = random_scene(20, degree=degree, seed=5)
+    scene = scene.with_tensors({"logit_opacities": torch.zeros(20)}, {})
+    cameras = around(2).in_two_sizes(2)
+    with mode():
+        found = observe(scene, cameras, backend="gsplat")
+    wanted = observe(scene, cameras, backend="torch")
+    assert not found.rgb.requires_grad
+    for name, limit in (("rgb", 1e-3), ("alpha", 1e-3), ("contributions", 1e-2)):
+        torch.testing.assert_close(
+            getattr(found, name).clone(), getattr(wanted, name), rtol=1e-4, atol=limit
+        )
 
 
 def test_empty(install):

@@ -266,6 +266,7 @@ class Metrics:
     """The metrics to compute; LPIPS weights are kept, so they are read once."""
 
     ssim: bool = True
+    alpha: bool = True  # whether to compare accumulated alpha
     lpips: LpipsWeights | None = None
     note: str = NOT_ASKED_FOR  # why LPIPS is omitted
     most_psnr: float = math.inf  # upper limit of PSNR, dB
@@ -358,7 +359,7 @@ class Scorer:
         scores = []
         for camera, colors, alpha in self._truths:
             image = render_views(scene, camera)
-            alphas = (image.alpha, alpha.to(image.alpha))
+            alphas = (image.alpha, alpha.to(image.alpha)) if self._metrics.alpha else None
             scores += [
                 self._metrics.compare(color, truth, alphas=alphas)
                 for color, truth in zip(self._over_all(image), colors, strict=True)

@@ -133,7 +133,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
             views = generated_views(theirs, config=config, seed=seed)
         else:
             views = split_views(cameras, config=config, seed=seed)
-        metrics = Metrics(ssim=False, most_psnr=MOST_PSNR)
+        metrics = Metrics(ssim=False, alpha=False, most_psnr=MOST_PSNR)
         scorer = Scorer(
             theirs,
             views.heldout,

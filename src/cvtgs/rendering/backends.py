@@ -161,7 +161,6 @@ def observe_in_two_passes(
     contributions: Callable[[GaussianScene, Cameras], Iterator[Tensor]],
     scene: GaussianScene,
     cameras: Cameras,
-    *,
     sh_degree: int,
 ) -> Iterator[tuple[RasterOutput, Float[Tensor, "n"]]]:
     """Render images, and each once more for the contributions to it."""

@@ -6,7 +6,7 @@ of 0.99.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache, partial
+from functools import cache
 from importlib import import_module
 from itertools import chain
 
@@ -111,7 +111,25 @@ def contributions(scene: GaussianScene, cameras: Cameras) -> Iterator[Float[Tens
         yield from gradient[:, :, 0].double().clamp_min(0.0)
 
 
-observe = partial(observe_in_two_passes, rasterize, contributions)
+def observe(
+    scene: GaussianScene, cameras: Cameras, *, sh_degree: int
+) -> Iterator[tuple[RasterOutput, Float[Tensor, "n"]]]:
+    """Yield every image, and the contributions to it, as gradients of one more colour channel."""
+    if sh_degree or len(scene) == 0:  # gsplat takes no further channel with SH coefficients
+        yield from observe_in_two_passes(rasterize, contributions, scene, cameras, sh_degree)
+        return
+    for camera in cameras.singles():
+        with torch.inference_mode(mode=False), torch.enable_grad():
+            plain = without_gradients(scene)
+            colors = evaluate(plain.sh0, plain.shN[:, :0], plain.means).float()
+            channel = torch.zeros_like(colors[:, :1], requires_grad=True)
+            layers, alpha = _rasterize_all(plain, camera, torch.cat([colors, channel], dim=1))
+            (gradient,) = torch.autograd.grad(layers[..., 3].sum(), channel)
+        layers, alpha = layers.detach().to(scene.dtype), alpha.detach().to(scene.dtype)
+        output = RasterOutput(rgb=layers[..., :3], depth=layers[..., 4], alpha=alpha[..., 0])
+        yield output, gradient[:, 0].double().clamp_min(0.0)
+
+
 blending_weights = torch_backend.blending_weights  # gsplat does not return them
 
 
