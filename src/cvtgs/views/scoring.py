@@ -27,7 +27,7 @@ of any number of Gaussians comparable."""
 
 _SPARSE = 4  # splats are measured on every fourth Gaussian of a sample, of four times the area
 _FEW = 20_000  # samples of fewer Gaussians are used whole
-_CAMERAS = 1  # cameras per chunk
+_TOGETHER = 64  # cameras of which contributions are kept at a time
 _ENCLOSING = 2.5  # a camera within this many standard deviations of a Gaussian is inside it
 
 
@@ -102,28 +102,37 @@ def measure_splats(
     scene: GaussianScene, widths: Float[Tensor, "n"], radius: float, cameras: Cameras
 ) -> SplatSizes:
     """Return the sizes of the splats that cameras show; ``widths`` need not be as drawn."""
-    painted = torch.stack(list(contributions_to_each(scene, cameras)))
-    means, (by_width, order) = scene.means.double(), widths.sort()
-    viewmats = cameras.viewmats.to(means)
-
-    def measure(part: slice) -> Float[Tensor, "c 3"]:
-        weights, forward = painted[part], viewmats[part, 2]
-        ahead = forward[:, :3] @ means.T + forward[:, 3:]
-        near, rows = (widths / ahead.clamp_min(1e-9)).sort(dim=1)
-        shares = weights[:, order].cpu().cumsum(dim=1)
-        return torch.stack(
-            [
-                _weighted_quantile(near.cpu(), weights.gather(1, rows).cpu().cumsum(dim=1), 0.5),
-                _weighted_quantile(by_width.cpu().expand(shares.shape), shares, 0.5),
-                _weighted_quantile(by_width.cpu().expand(shares.shape), shares, 0.1),
-            ],
-            dim=1,
-        )
-
-    found = torch.cat(in_chunks(measure, len(cameras), _CAMERAS, scene.device))
+    starts = range(0, len(cameras), _TOGETHER)
+    parts = [cameras.select(range(len(cameras))[start : start + _TOGETHER]) for start in starts]
+    found = torch.cat([_splat_quantiles(scene, widths, part) for part in parts])
     share_of_image = cameras.Ks[:, 0, 0].double().cpu() / max(cameras.width, cameras.height)
     in_image, in_scene, finest = found.unbind(1)
     return SplatSizes(in_image * share_of_image, in_scene / radius, finest / radius)
+
+
+def _splat_quantiles(
+    scene: GaussianScene, widths: Float[Tensor, "n"], cameras: Cameras
+) -> Float[Tensor, "c 3"]:
+    """Return medians of widths over depths and of widths, and lower deciles of widths."""
+    painted = torch.stack(list(contributions_to_each(scene, cameras)))
+    means, (by_width, order) = scene.means.double(), widths.sort()
+    forwards = cameras.viewmats[:, 2].to(means)
+
+    def measure(part: slice) -> Float[Tensor, "p 3"]:
+        weights, forward = painted[part], forwards[part]
+        ahead = forward[:, :3] @ means.T + forward[:, 3:]
+        near, rows = (widths / ahead.clamp_min(1e-9)).sort(dim=1)
+        near_shares = weights.gather(1, rows).cpu().cumsum(dim=1)
+        shares = weights[:, order].cpu().cumsum(dim=1)
+        ascending = by_width.cpu().expand(shares.shape)
+        quantiles = [
+            _weighted_quantile(near.cpu(), near_shares, 0.5),
+            _weighted_quantile(ascending, shares, 0.5),
+            _weighted_quantile(ascending, shares, 0.1),
+        ]
+        return torch.stack(quantiles, dim=1)
+
+    return torch.cat(in_chunks(measure, len(cameras), 1, scene.device))
 
 
 def _weighted_quantile(
