@@ -7,6 +7,8 @@ import torch
 
 from cvtgs.analysis.analyze import visibility_cameras
 from cvtgs.config import SimplifyConfig
+from cvtgs.evaluation import scorer as scorer_module
+from cvtgs.evaluation.scorer import BLACK, WHITE, Metrics, Scorer, render_views
 from cvtgs.progress import silent
 from cvtgs.refinement import RefineConfig, optimize
 from cvtgs.refinement.images import ImageBuffer, RefineViews, generated_views, split_views
@@ -129,3 +131,24 @@ def test_old_images_leave_the_buffer_in_random_order():
     assert not set(eyes[:20]) & set(eyes[100:])
     new = [step for step in range(20, 130) if eyes[step] not in eyes[:step]]
     assert any(eyes[step - 1] in eyes[step:] for step in new)
+
+
+@pytest.mark.parametrize(("pixels", "groups"), [(1, [1, 1, 1, 1, 1]), (1 << 21, [3, 1, 1])])
+def test_small_views_of_one_size_are_scored_together(monkeypatch, pixels, groups):
+    full, small = full_scene(200), discolored(full_scene(200))
+    other = ring(1, width=20, height=16)
+    cameras = [*ring(3).singles(), other, ring(1)]
+    rendered = []
+
+    def counted(scene, cameras):
+        rendered.append(len(cameras))
+        return render_views(scene, cameras)
+
+    scorer = Scorer(full, cameras, metrics=Metrics(), backgrounds=(BLACK, WHITE))
+    monkeypatch.setattr(scorer_module, "PIXELS_TOGETHER", pixels)
+    monkeypatch.setattr(scorer_module, "render_views", counted)
+    scores = scorer.score(small)
+    assert rendered == groups
+    for row, camera in enumerate(cameras):
+        single = Scorer(full, [camera], metrics=Metrics(), backgrounds=(BLACK, WHITE))
+        assert single.score(small) == scores[2 * row : 2 * row + 2]

@@ -28,6 +28,7 @@ Color = tuple[float, float, float]
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 MOST_PSNR = 60.0  # upper limit of PSNR where scores are compared, dB: closer images count as equal
+PIXELS_TOGETHER = 1 << 21  # of images that are rendered at once to be scored
 LEAST_COVER = 1e-4  # mean alpha that one image must reach if all centres are outside every image
 
 
@@ -325,6 +326,10 @@ def scene_scores(name: str, count: int, rows: Sequence[ImageScores]) -> SceneSco
     )
 
 
+Truth = tuple[Cameras, list[Tensor], Tensor]
+"""A camera, its image over every background, and its accumulated alpha."""
+
+
 class Scorer:
     """Scores scenes against images of a full scene, which are rendered once.
 
@@ -343,7 +348,7 @@ class Scorer:
     ) -> None:
         self._metrics = metrics
         self._backgrounds = [full.means.new_tensor(color) for color in backgrounds]
-        self._truths: list[tuple[Cameras, list[Tensor], Tensor]] = []
+        self._truths: list[Truth] = []
         for camera in cameras:
             progress(len(self._truths))
             self._keep(render_views(full, camera))
@@ -357,14 +362,28 @@ class Scorer:
     def score(self, scene: GaussianScene) -> list[ImageScores]:
         """Score a scene, view by view and over every background."""
         scores = []
-        for camera, colors, alpha in self._truths:
-            image = render_views(scene, camera)
-            alphas = (image.alpha, alpha.to(image.alpha)) if self._metrics.alpha else None
-            scores += [
-                self._metrics.compare(color, truth, alphas=alphas)
-                for color, truth in zip(self._over_all(image), colors, strict=True)
-            ]
+        for truths in self._small_groups():
+            images = render_views(scene, join_cameras([camera for camera, _, _ in truths]))
+            for row, (_, colors, alpha) in enumerate(truths):
+                image = images.select(row)
+                alphas = (image.alpha, alpha.to(image.alpha)) if self._metrics.alpha else None
+                scores += [
+                    self._metrics.compare(color, truth, alphas=alphas)
+                    for color, truth in zip(self._over_all(image), colors, strict=True)
+                ]
         return scores
+
+    def _small_groups(self) -> list[list[Truth]]:
+        """Return views in groups of one size and few pixels, which are rendered together."""
+        groups: list[list[Truth]] = []
+        for truth in self._truths:
+            size = truth[2].shape
+            fits = groups and groups[-1][0][2].shape == size
+            if fits and (len(groups[-1]) + 1) * size.numel() <= PIXELS_TOGETHER:
+                groups[-1].append(truth)
+            else:
+                groups.append([truth])
+        return groups
 
     def _keep(self, truth: ViewImages) -> None:
         self._truths.append((truth.cameras, self._over_all(truth), truth.alpha))
