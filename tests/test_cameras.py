@@ -1,11 +1,12 @@
 """Cameras: invalid ones are refused; selection of every ``stride``-th pixel."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from cvtgs.cameras import Cameras, look_at
+from cvtgs.cameras import Cameras, join_cameras, look_at
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.rendering import render
 from refine_cases import ring
@@ -241,3 +242,15 @@ def test_autocast_does_not_move_cameras():
     wanted = look_at(eyes, eyes + 1, up)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert torch.equal(look_at(eyes, eyes + 1, up), wanted)
+
+
+def test_joined_cameras_keep_what_each_is_like():
+    one, two = ring(2), ring(3).every(2, first=(0, 0))
+    assert join_cameras([one, one]).strides == ()
+    assert join_cameras([one, one]).ignores_tag == ()
+    two = replace(two, width=one.width, height=one.height, ignores_tag=(True,) * len(two))
+    joined = join_cameras([one, two])
+    assert joined.strides == (1,) * len(one) + (2,) * len(two)
+    assert joined.ignores_tag == (False,) * len(one) + (True,) * len(two)
+    assert torch.equal(joined.Ks[len(one) :], two.Ks)
+    assert torch.equal(joined.viewmats[: len(one)], one.viewmats)
