@@ -10,11 +10,13 @@ import pytest
 import torch
 
 import gsplat_stand_in
-from cvtgs import GaussianScene
+from cvtgs import GaussianScene, synthetic
 from cvtgs.cameras import Cameras
 from cvtgs.errors import MissingDependencyError
 from cvtgs.rendering import choose_backend, gsplat_backend, observe, projection, render
 from cvtgs.rendering.render import contributions_to_each
+from cvtgs.views import find_view_positions, mixed_views
+from cvtgs.views.scoring import image_device
 from render_cases import MIP, around, oracle_images, scene_of, straight
 from scenes import random_scene
 
@@ -234,6 +236,23 @@ def test_images_and_contributions_in_one_pass(install, mode, degree):
         torch.testing.assert_close(
             getattr(found, name).clone(), getattr(wanted, name), rtol=1e-4, atol=limit
         )
+
+
+def test_views_are_chosen_by_gsplat_as_on_the_host(install):
+    positions = find_view_positions(synthetic.scene("object", 150, sh_degree=0, seed=0))
+    wanted = mixed_views(positions, 4, size=64)
+    together = []
+
+    def rasterization(**options):
+        together.append(len(options["viewmats"]))
+        return gsplat_stand_in.rasterization(**options)
+
+    gsplat_backend._failure.cache_clear()
+    install(rasterization)
+    there = replace(positions, layout=replace(positions.layout, device=CUDA))
+    assert (image_device(positions.layout).type, image_device(there.layout)) == ("cpu", CUDA)
+    assert torch.equal(mixed_views(there, 4, size=64).viewmats, wanted.viewmats)
+    assert max(together) > 2
 
 
 def test_empty(install):

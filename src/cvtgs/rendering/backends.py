@@ -145,15 +145,13 @@ def collect_images(
 
 
 def without_gradients(scene: GaussianScene) -> GaussianScene:
-    """Return a scene to take gradients of something else through: constants that autograd takes.
-
-    Call it outside of inference mode.
-    """
-    tensors = {
-        name: tensor.clone() if tensor.is_inference() else tensor.detach()
-        for name, tensor in scene.tensors().items()
-    }
-    return scene.with_tensors(tensors, {})
+    """Return a scene of constants that autograd takes, also in inference mode."""
+    with torch.inference_mode(mode=False):
+        tensors = {
+            name: tensor.clone() if tensor.is_inference() else tensor.detach()
+            for name, tensor in scene.tensors().items()
+        }
+        return scene.with_tensors(tensors, {})
 
 
 def observe_in_two_passes(

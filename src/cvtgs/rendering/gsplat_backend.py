@@ -100,10 +100,10 @@ def contributions(scene: GaussianScene, cameras: Cameras) -> Iterator[Float[Tens
     groups = _alike(scene, cameras)
     if list(chain(*groups)) != list(range(len(cameras))):
         groups = [[row] for row in range(len(cameras))]  # in order, and few are kept
+    plain = without_gradients(scene)
     for rows in groups:
         part = cameras.select(rows)
         with torch.inference_mode(mode=False), torch.enable_grad():
-            plain = without_gradients(scene)
             shape = len(part), len(scene), 1
             colors = plain.means.new_zeros(shape, dtype=torch.float32, requires_grad=True)
             layers, _ = _rasterize_all(plain, part, colors, render_mode="RGB")
@@ -118,9 +118,9 @@ def observe(
     if sh_degree or len(scene) == 0:  # gsplat takes no further channel with SH coefficients
         yield from observe_in_two_passes(rasterize, contributions, scene, cameras, sh_degree)
         return
+    plain = without_gradients(scene)
     for camera in cameras.singles():
         with torch.inference_mode(mode=False), torch.enable_grad():
-            plain = without_gradients(scene)
             colors = evaluate(plain.sh0, plain.shN[:, :0], plain.means).float()
             channel = torch.zeros_like(colors[:, :1], requires_grad=True)
             layers, alpha = _rasterize_all(plain, camera, torch.cat([colors, channel], dim=1))

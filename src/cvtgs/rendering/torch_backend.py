@@ -79,11 +79,11 @@ def rasterize(
 
 def contributions(scene: GaussianScene, cameras: Cameras) -> Iterator[Float[Tensor, "n"]]:
     """Yield contributions, as gradients of summed images with respect to the colours."""
+    tensors = backends.without_gradients(scene).tensors()
     for camera in cameras.singles():
         with torch.inference_mode(mode=False), torch.enable_grad():
             # Mid-grey, so that no colour is clipped; the higher SH bands do not matter here.
             sh0 = torch.zeros_like(scene.sh0).requires_grad_()
-            tensors = backends.without_gradients(scene).tensors()
             gray = scene.with_tensors(tensors | {"sh0": sh0, "shN": tensors["shN"][:, :0]}, {})
             image = rasterize(gray, camera, sh_degree=0).rgb
             (gradient,) = torch.autograd.grad(image[..., 0].sum(), sh0)

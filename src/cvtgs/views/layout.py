@@ -8,11 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.devices import HOST
 from cvtgs.errors import InvalidSceneError
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import divide
-from cvtgs.rendering.backends import choose_backend
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import valid_part, with_finite_opacities
 from cvtgs.views.up import VOXEL_SIZE, Voxels, among_others, find_floor, find_up, voxelize
@@ -177,7 +175,7 @@ class SceneLayout:
     """Position, extent and orientation of the content of a scene, float64, in scene units."""
 
     sample: GaussianScene  # covers the same area as the scene; SH degree 0, on the CPU
-    renders_on: torch.device  # where small images are rendered
+    device: torch.device  # of the scene
     sized: SizedPoints
     frame: RobustFrame  # of the visible Gaussians
     voxels: Voxels  # the surfaces near the middle
@@ -234,7 +232,7 @@ def find_layout(scene: GaussianScene) -> SceneLayout:
     room = find_room(voxels, sized, frame, middle=middle, up=up)
     return SceneLayout(
         sample=sample,
-        renders_on=scene.device if choose_backend("auto", scene.device)[0] == "gsplat" else HOST,
+        device=scene.device,
         sized=sized,
         frame=frame,
         voxels=voxels,

@@ -31,6 +31,7 @@ from cvtgs.views.scoring import (
     PIXELS,
     SMOOTH,
     cameras_at,
+    image_device,
     measure_splats,
     splat_sizes,
     splat_widths,
@@ -323,7 +324,8 @@ def split_by_clutter(
         return eyes, none  # the sample, which has larger splats, shows as much
     sample, enlargement = covering_sample(viewable_part(scene), _SAMPLE)
     widths = splat_widths(sample) * torch.exp(-enlargement[:, 0].double())
-    sample, widths = sample.to(layout.renders_on), widths.to(layout.renders_on)
+    device = image_device(layout)
+    sample, widths = sample.to(device), widths.to(device)
     for most in _MEASURED:
         few = eyes[:: -(-len(eyes) // most)]
         cameras = _facing_middle(layout, few)

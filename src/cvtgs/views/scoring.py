@@ -8,9 +8,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.devices import in_chunks
+from cvtgs.devices import HOST, in_chunks
 from cvtgs.math import parameters
-from cvtgs.rendering.render import contributions_to_each, render
+from cvtgs.rendering import choose_backend, render
+from cvtgs.rendering.render import contributions_to_each
 from cvtgs.scene import GaussianScene
 from cvtgs.views.layout import SceneLayout
 
@@ -51,6 +52,13 @@ def cameras_at(
     )
 
 
+def image_device(layout: SceneLayout) -> torch.device:
+    """Return where to render small images: on the device of the scene if gsplat works there."""
+    if layout.device.type == "cpu":
+        return HOST
+    return layout.device if choose_backend("auto", layout.device)[0] == "gsplat" else HOST
+
+
 def score_cameras(
     layout: SceneLayout, cameras: Cameras, *, distances: Float[Tensor, "c"]
 ) -> tuple[Bool[Tensor, "c"], Float[Tensor, "c"]]:
@@ -60,7 +68,7 @@ def score_cameras(
     hides its middle, or if too little of the image is filled.
     """
     small = cameras.fitted(PIXELS, least=8)
-    images = render(layout.sample.to(layout.renders_on), small, depth=True)
+    images = render(layout.sample.to(image_device(layout)), small, depth=True)
     alpha = images.alpha.cpu()
     depth = alpha.new_zeros(()) if images.depth is None else images.depth.cpu()
     near = (alpha > _VISIBLE) & (depth < _NEAR * distances.to(depth)[:, None, None])
@@ -86,7 +94,7 @@ class SplatSizes(NamedTuple):
 def splat_sizes(layout: SceneLayout, cameras: Cameras) -> SplatSizes:
     """Return the median size of the splats that each camera shows, for at least one camera."""
     step = _SPARSE if len(layout.sample) >= _FEW else 1
-    sample = layout.sample[::step].to(layout.renders_on)
+    sample = layout.sample[::step].to(image_device(layout))
     widths = splat_widths(sample)
     enlarged = sample.log_scales + 0.5 * math.log(step)
     sample = sample.with_tensors({"log_scales": enlarged}, {})
