@@ -63,19 +63,21 @@ def stratified_seeds(
     check_whole(count, "count", most=len(weights), things="points")
     if checked_sum(weights, "weights") == 0.0:
         weights = torch.ones_like(weights)
-    certain = torch.zeros(len(weights), dtype=torch.bool, device=weights.device)
-    while True:
-        free = count - int(certain.sum())
-        step = float(weights[~certain].sum()) / free if free else 0.0
-        heavier = ~certain & (weights >= step)
-        if free == 0 or not bool(heavier.any()) or step == 0.0:
+    rows, left = torch.empty(0, dtype=torch.int64, device=weights.device), weights.clone()
+    while free := count - len(rows):
+        step = float(left.sum()) / free
+        heavier = (left >= step).nonzero()[:, 0]
+        if len(heavier) == 0 or step == 0.0:
             break
-        heavy = heavier.nonzero()[:, 0]
-        heaviest = torch.sort(weights[heavy], stable=True, descending=True).indices[:free]
-        certain[heavy[heaviest]] = True
-    rows, others = certain.nonzero()[:, 0], (~certain).nonzero()[:, 0]
+        order = torch.sort(left[heavier], stable=True, descending=True).indices
+        rows = torch.cat([rows, heavier[order[:free]]])
+        left[rows] = 0.0
+    shares = weights[rows]
     if free:  # the middles of equal steps of accumulated weight
-        total = running_sums(weights[others])
+        is_other = torch.ones_like(weights, dtype=torch.bool)
+        is_other[rows] = False
+        others = is_other.nonzero()[:, 0]
+        total = running_sums(weights.index_select(0, others))
         middles = (torch.arange(free, device=weights.device) + 0.5) * (total[-1] / free)
         picks = torch.searchsorted(total, middles).clamp_max(len(others) - 1)
         # Weights below one step give distinct picks, except for rounding and zero weights:
@@ -83,8 +85,10 @@ def stratified_seeds(
         places = torch.arange(free, device=weights.device)
         picks = (picks - places).cummax(0).values + places
         picks = torch.minimum(picks, len(others) - free + places)
-        rows = torch.sort(torch.cat([rows, others[picks]])).values
-    return rows, torch.where(certain, weights, step)[rows]
+        rows = torch.cat([rows, others[picks]])
+        shares = torch.cat([shares, shares.new_full((free,), step)])
+    rows, order = torch.sort(rows)
+    return rows, shares[order]
 
 
 @checked

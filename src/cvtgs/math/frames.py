@@ -128,9 +128,10 @@ def morton_order(
     low = points.amin(dim=0)
     side = (points.amax(dim=0) - low).amax().clamp_min(torch.finfo(points.dtype).tiny)
     code = torch.zeros(len(points), dtype=torch.int64, device=points.device)
-    for axis in range(3):
-        steps = ((points[:, axis] - low[axis]) / side * (2**BITS - 1)).to(torch.int64)
-        code |= _spread_bits(steps) << axis
+    for part in row_chunks(len(points), CHUNK, points.device):  # these fit into a cache
+        for axis in range(3):
+            steps = ((points[part, axis] - low[axis]) / side * (2**BITS - 1)).to(torch.int64)
+            code[part] |= _spread_bits(steps) << axis
     codes, order = torch.sort(code, stable=True)
     if ties is not None and code.device.type != "cpu":  # more work, but no synchronization
         rows = torch.sort(ties, stable=True).indices

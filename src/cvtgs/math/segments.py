@@ -95,7 +95,7 @@ def label_sums(
     for column in columns:
         values = column.double() if weights is None else torch.mul(weights, column, out=buffer)
         if on_host:
-            sums.append(torch.bincount(labels, values, minlength=count))
+            sums.append(values.new_zeros(count).scatter_add_(0, labels, values))
         else:
             sums.append(segment_sum(values[order], offsets))
     return torch.stack(sums)
