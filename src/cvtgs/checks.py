@@ -1,14 +1,12 @@
 """Check the arguments of public functions against the types and shapes of their signatures."""
 
-import math
 from collections.abc import Callable, Mapping
 from functools import wraps
 from inspect import Parameter, signature
 from types import NoneType, UnionType
 from typing import Any, ParamSpec, TypeVar, get_args
 
-import torch
-from jaxtyping import Float, jaxtyped
+from jaxtyping import jaxtyped
 from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError
@@ -82,14 +80,3 @@ def check_range(values: Tensor, most: int, name: str) -> None:
             raise InvalidArgumentError(
                 f"{name} must be between 0 and {most}, found {low} to {high}."
             )
-
-
-def checked_sum(values: Float[Tensor, "n"], name: str) -> float:
-    """Return the sum of numbers; raise unless all are finite and at least 0."""
-    least, most, total = torch.stack([*values.aminmax(), values.sum()]).tolist()  # one wait
-    if not (least >= 0.0 and most < math.inf):
-        row = int((~((values >= 0.0) & (values < math.inf))).nonzero()[0])
-        raise InvalidArgumentError(
-            f"{name} must be finite and at least 0, found {float(values[row])} in row {row}."
-        )
-    return float(total)

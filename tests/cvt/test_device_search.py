@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from cvtgs.cvt import device_search, nearest, nearest_neighbors, nearest_site
-from cvtgs.cvt.device_search import nearest_in_tiles
-from cvtgs.cvt.leaves import Boxes, boxes_of, home_leaves, split_sites
+from cvtgs.cvt.device_search import Boxes, boxes_of, home_leaves, nearest_in_tiles, split_sites
 from cvtgs.cvt.nearest import nearest_several
 from pretended_device import pretended_cuda
 

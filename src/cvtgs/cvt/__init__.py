@@ -7,13 +7,15 @@ from cvtgs.cvt.nearest import (
     nearest_scipy,
     nearest_site,
 )
-from cvtgs.cvt.seeding import choose_seeds, stratified_seeds, weighted_seeds
 from cvtgs.cvt.tessellate import (
     LloydResult,
     Tessellation,
+    choose_seeds,
     fill_empty_cells,
     lloyd,
+    stratified_seeds,
     tessellate,
+    weighted_seeds,
 )
 
 __all__ = [

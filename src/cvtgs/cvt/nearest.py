@@ -263,11 +263,6 @@ def runs_of_equal(sites: Float[Tensor, "m d"]) -> tuple[Int[Tensor, "m"], Int[Te
     return order, places - starts
 
 
-def choose_search(*, has_duplicates: bool) -> NearestSite:
-    """Choose the search; with many duplicates, each position is searched once."""
-    return search_once_per_position if has_duplicates else nearest_site
-
-
 def search_once_per_position(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"]
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:

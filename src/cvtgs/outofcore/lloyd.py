@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cvtgs.analysis import SceneAnalysis
 from cvtgs.cvt import choose_seeds, gaussian_weights, nearest_site
-from cvtgs.cvt.nearest import choose_search
+from cvtgs.cvt.nearest import search_once_per_position
 from cvtgs.cvt.tessellate import centroids, sample_points, weighted_sums
 from cvtgs.devices import one_thread
 from cvtgs.grouping import curve_order, embed_rows
@@ -198,7 +198,7 @@ def _embedded_rows(
 def _assign(job: Job, iteration: int, block: int, points: Tensor) -> tuple[Tensor, Assignment]:
     """Return the own sites, and the nearest site of any block for every point."""
     has_duplicates = job.read_scan().plan.duplicates.active
-    nearest = choose_search(has_duplicates=has_duplicates)
+    nearest = search_once_per_position if has_duplicates else nearest_site
     sites = points[:0].double()
     if job.cells[block]:
         sites = job.read("sites", block, iteration)["sites"]
