@@ -5,17 +5,26 @@ from dataclasses import replace
 
 import pytest
 import torch
+from scipy.special import spence
 
 import oracles
 from cvtgs import GaussianScene
 from cvtgs.cells import Partition, merge_cells
-from cvtgs.cells.merge import gather_members, mean_and_covariance, merged_depth
+from cvtgs.cells.merge import (
+    FULL_DEPTH,
+    depth_from_integrated,
+    gather_members,
+    integrated_depth,
+    mean_and_covariance,
+    merged_depth,
+)
 from cvtgs.cells.moments import mass_unit
 from cvtgs.config import MergeConfig
-from cvtgs.math import depths, parameters
+from cvtgs.math import parameters
 from cvtgs.tags import ANTIALIASED
 from scenes import assert_same_gaussians, covariances_of, moved, oracle_rows, random_scene
 
+INF = float("inf")
 RULES = {
     "paper": MergeConfig(area_power=0.0, opacity="union"),
     "between": MergeConfig(area_power=0.5, opacity="saturating"),
@@ -114,7 +123,7 @@ def test_saturating_conserves_the_sum_of_depth_over_an_image(shift: float):
     assert int(clear.sum()) > 50
     found = image_sums(small.opacities, areas)
     torch.testing.assert_close(found[clear], wanted[clear], rtol=1e-4, atol=0)
-    opaque = (wanted >= depths.FULL_DEPTH * areas) & (cells.offsets.diff() > 1)
+    opaque = (wanted >= FULL_DEPTH * areas) & (cells.offsets.diff() > 1)
     torch.testing.assert_close(small.opacities[opaque], torch.full_like(areas[opaque], 0.99))
 
 
@@ -192,3 +201,29 @@ def test_order_of_members_does_not_matter(config):
 def test_a_few_giants_do_not_set_the_unit_of_masses():
     assert float(mass_unit(torch.tensor([1.0, 1.0, 7.0]), 3.0)) == 3.0
     assert float(mass_unit(torch.ones(3), 1e60)) == 1e6
+
+
+def test_integrated_depth_is_the_dilogarithm():
+    logits = torch.linspace(-13.8, 13.8, 1001, dtype=torch.float64)
+    centres = parameters.optical_depth_from_logit(logits)
+    values = integrated_depth(centres)
+    wanted = torch.from_numpy(spence(torch.sigmoid(-logits).numpy()))
+    torch.testing.assert_close(values, wanted, rtol=1e-9, atol=0)
+    torch.testing.assert_close(depth_from_integrated(values), centres, rtol=1e-9, atol=1e-9)
+
+
+def test_integrated_depths_above_the_largest_are_clamped():
+    values = torch.tensor([0.0, 1e-300, 1.6449341, 2.0, 1e30, INF], dtype=torch.float64)
+    centres = depth_from_integrated(values)
+    assert bool((centres >= 0).all())
+    assert bool((centres.diff() >= 0).all())
+    assert centres[:2].tolist() == pytest.approx([0.0, 1e-300], abs=1e-300)
+    assert centres[3:].tolist() == [parameters.LOGIT_LIMIT] * 3
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (3,), (2, 3)])
+@pytest.mark.parametrize("function", [integrated_depth, depth_from_integrated])
+def test_shape_and_dtype_of_depths_are_kept(function, shape):
+    for dtype in (torch.float32, torch.float64):
+        result = function(torch.full(shape, 0.25, dtype=dtype))
+        assert (result.shape, result.dtype) == (shape, dtype)

@@ -4,10 +4,9 @@ import math
 
 import pytest
 import torch
-from scipy.special import spence
 
 import oracles
-from cvtgs.math import depths, parameters
+from cvtgs.math import parameters
 
 DTYPES = [torch.float32, torch.float64]
 INF = float("inf")
@@ -42,8 +41,6 @@ def test_zero_divided_by_zero_is_zero():
         parameters.opacity_from_optical_depth,
         parameters.positive_log,
         parameters.logit_from_optical_depth,
-        depths.integrated_depth,
-        depths.depth_from_integrated,
     ],
 )
 def test_shape_and_dtype_are_kept(function, shape):
@@ -106,24 +103,6 @@ def test_depth_round_trip_keeps_digits_at_both_ends():
     torch.testing.assert_close(
         parameters.logit_from_optical_depth(depths), logits, rtol=1e-9, atol=1e-9
     )
-
-
-def test_integrated_depth_is_the_dilogarithm():
-    logits = torch.linspace(-13.8, 13.8, 1001, dtype=torch.float64)
-    centres = parameters.optical_depth_from_logit(logits)
-    values = depths.integrated_depth(centres)
-    wanted = torch.from_numpy(spence(torch.sigmoid(-logits).numpy()))
-    torch.testing.assert_close(values, wanted, rtol=1e-9, atol=0)
-    torch.testing.assert_close(depths.depth_from_integrated(values), centres, rtol=1e-9, atol=1e-9)
-
-
-def test_integrated_depths_above_the_largest_are_clamped():
-    values = torch.tensor([0.0, 1e-300, 1.6449341, 2.0, 1e30, INF], dtype=torch.float64)
-    centres = depths.depth_from_integrated(values)
-    assert bool((centres >= 0).all())
-    assert bool((centres.diff() >= 0).all())
-    assert centres[:2].tolist() == pytest.approx([0.0, 1e-300], abs=1e-300)
-    assert centres[3:].tolist() == [parameters.LOGIT_LIMIT] * 3
 
 
 def test_depth_inverts_opacity():

@@ -13,7 +13,7 @@ from cvtgs.cells.partition import Partition
 from cvtgs.checks import checked
 from cvtgs.config import MergeConfig
 from cvtgs.devices import chunk_length, in_threads
-from cvtgs.math import depths, parameters
+from cvtgs.math import parameters
 from cvtgs.math.segments import (
     gather_columns,
     segment_argmax,
@@ -32,6 +32,9 @@ OPAQUE = -math.log(0.01)
 """Optical depth of an opacity of 0.99, the largest that rasterizers paint at a pixel."""
 
 DOMINANT = 0.99  # a member with more than this share of the mass of its cell represents it
+
+FULL_DEPTH = math.pi**2 / 6
+"""The optical depth of an opaque Gaussian summed over an image, as a multiple of its area."""
 
 
 @checked
@@ -200,20 +203,49 @@ def merged_depth(
 
     By ``union``, all members lie behind one another, and depths add up (the paper has this rule).
     By ``saturating``, the contributions of members to an image add up
-    (:func:`cvtgs.math.depths.integrated_depth`), until the cell is opaque. With the compensation of
+    (:func:`integrated_depth`), until the cell is opaque. With the compensation of
     Mip-Splatting, no dilation closes the gaps between merged Gaussians: then it is the geometric
     mean of this depth and of the one that conserves central depth times area, which is deeper where
     opaque members lie side by side.
     """
     if rule == "union":
         return segment_sum(members.depths, members.offsets)
-    images = depths.integrated_depth(members.depths) * members.areas
+    images = integrated_depth(members.depths) * members.areas
     totals = segment_sum(images, members.offsets)
-    found = depths.depth_from_integrated(parameters.divide(totals, areas)).clamp_max(OPAQUE)
+    found = depth_from_integrated(parameters.divide(totals, areas)).clamp_max(OPAQUE)
     if not antialiased:
         return found
     centers = segment_sum(members.depths.clamp_max(OPAQUE) * members.areas, members.offsets)
     return torch.sqrt(found * parameters.divide(centers, areas).clamp_max(OPAQUE))
+
+
+def integrated_depth(depths: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Return the optical depth of Gaussians summed over an image, as a multiple of their area.
+
+    A Gaussian transmits ``1 - a g(x)`` of the light, with g = 1 at its centre. The integral of
+    ``-log(1 - a g(x))``, divided by its projected area ``2 pi sigma_1 sigma_2``, is the dilogarithm
+    ``Li2(a)``: it grows like a, and ends at ``pi^2 / 6``, however large the depth at the centre.
+    """
+    others = -parameters.positive_log(parameters.opacity_from_optical_depth(depths))  # -log(a)
+    small = torch.minimum(depths, others)
+    square = small.square()
+    series = 1 / 3600 - square * (1 / 211680 - square / 10886400)
+    values = small - square / 4 + small * square * (1 / 36 - square * series)
+    return torch.where(depths <= others, values, FULL_DEPTH - depths * others - values)
+
+
+def depth_from_integrated(values: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Return the optical depth at the centre, the inverse of :func:`integrated_depth`."""
+    tiny = torch.finfo(values.dtype).tiny
+    values = values.clamp_max(FULL_DEPTH)
+    depths = torch.maximum(values, -parameters.positive_log(1 - values / FULL_DEPTH)).clamp(
+        tiny, parameters.LOGIT_LIMIT
+    )
+    for _ in range(6):  # Newton, from below
+        slopes = depths / torch.expm1(depths)
+        depths = depths + (values - integrated_depth(depths)) / slopes
+        depths = depths.clamp(tiny, parameters.LOGIT_LIMIT)
+    return depths
 
 
 @checked
