@@ -100,7 +100,7 @@ def gaussian_moments(
         bands = scene.sh0.index_select(0, some)[:, 0]
         colors[:, part] = (0.5 + SH_C0 * bands.double()).clamp(0.0, LARGEST_COLOR).T
         if directions is not None:
-            varying[:, part] = view_colors(scene, some, directions).T
+            varying[:, part] = view_colors(scene.shN.index_select(0, some), directions).T
 
     in_chunks(moments_of, count, CHUNK, device)  # a few columns of a chunk fit into a cache
     tiny = torch.finfo(torch.float64).tiny
@@ -187,7 +187,7 @@ def view_components(
     both = torch.cat([first, first + 1])
     bands = scene.shN.index_select(0, rows.index_select(0, both))
     bands, weights = move_together([bands, masses.index_select(0, both)], HOST)
-    colors, weights = _project(bands.double(), torch.eye(width, device=HOST)), weights.double()
+    colors, weights = view_colors(bands.double(), torch.eye(width, device=HOST)), weights.double()
     weights = weights / weights.sum().clamp_min(torch.finfo(torch.float64).tiny)
     centered = colors - weights @ colors
     variances, axes = torch.linalg.eigh(centered.T @ (centered * weights[:, None]))
@@ -201,19 +201,14 @@ def view_components(
 
 
 def view_colors(
-    scene: GaussianScene, rows: Int[Tensor, "r"], components: Float[Tensor, "c k"]
-) -> Float[Tensor, "r k"]:
+    bands: Float[Tensor, "n b 3"], components: Float[Tensor, "c k"]
+) -> Float[Tensor, "n k"]:
     """Return the components of the view-dependent colour of some Gaussians, in units of RGB.
 
     The sum of the squared differences of two Gaussians is at most the squared difference of their
     view-dependent colours, averaged over all directions. Bands beyond those of ``components``,
     which :func:`view_components` returns, are ignored.
     """
-    return _project(scene.shN.index_select(0, rows), components)
-
-
-def _project(bands: Float[Tensor, "n b 3"], components: Float[Tensor, "c k"]) -> Tensor:
-    """Return components, in units in which the mean of a squared colour is the sum of squares."""
     coefficients = bands.flatten(1)[:, : len(components)]
     norms = SH_C0 * torch.linalg.vector_norm(coefficients, dim=1, keepdim=True)
     factors = SH_C0 * LARGEST_COLOR / norms.double().clamp_min(LARGEST_COLOR)
