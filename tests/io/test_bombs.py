@@ -28,7 +28,7 @@ FULLEST = FREE_BYTES // 56
 """Most Gaussians without view-dependent colour that a file of any size may claim."""
 
 MEASURE = """
-import os, sys, torch, cvtgs, cvtgs.io.sog, cvtgs.io.spz, cvtgs.io.checkpoints
+import os, sys, torch, cvtgs, cvtgs.io.sog, cvtgs.io.spz, cvtgs.io.dicts
 for path in sys.argv[1:]:
     child = os.fork()
     if child == 0:

@@ -26,8 +26,7 @@ from cvtgs.io.arrays import (
 )
 from cvtgs.io.files import open_input
 from cvtgs.io.limits import FORMAT_LIMITS
-from cvtgs.io.ply.header import Element, Header, header_bytes, read_header, row_dtype
-from cvtgs.io.ply.properties import check_size
+from cvtgs.io.ply.header import Element, Header, check_size, header_bytes, read_header, row_dtype
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 

@@ -41,8 +41,8 @@ _READERS: Mapping[str, str] = {
     "meta.json": "cvtgs.io.sog:read_sog",
     ".glb": "cvtgs.io.gltf:read_gltf",
     ".gltf": "cvtgs.io.gltf:read_gltf",
-    ".ckpt": "cvtgs.io.checkpoints:read_checkpoint",
-    ".pt": "cvtgs.io.checkpoints:read_checkpoint",
+    ".ckpt": "cvtgs.io.dicts:read_checkpoint",
+    ".pt": "cvtgs.io.dicts:read_checkpoint",
 }
 """Readers by suffix, imported when needed; the first suffix that fits counts."""
 

@@ -1,9 +1,10 @@
-"""Read PLY scenes: the common layout by memory mapping, others by plyfile, imported only here."""
+"""Read PLY scenes, at once or in parts; plyfile, imported only here, reads uncommon layouts."""
 
 import io
 import os
 import warnings
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,15 +20,21 @@ from cvtgs.errors import (
     how_to_install,
     warn,
 )
+from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
 from cvtgs.io.files import open_input
-from cvtgs.io.ply.header import SCALARS, Element, Header, Layout, read_header, row_dtype
-from cvtgs.io.ply.properties import (
+from cvtgs.io.ply.header import (
+    SCALARS,
+    Element,
+    Header,
+    Layout,
     check_size,
     dtype_of,
     find_vertices,
     is_standard,
     layout_of,
+    read_header,
     rest_count_of,
+    row_dtype,
     standard_slots,
 )
 from cvtgs.math.spherical_harmonics import REST_COUNTS
@@ -264,3 +271,93 @@ def _explain(error: Any, elements: tuple[Element, ...], path: str) -> str:
         )
     kind = f"list of {prop.type}" if prop.count_type else prop.type
     return f"{place}: property {shown(prop.name)} must be a {kind}, found an unreadable value."
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlyRows:
+    """The rows of a binary little endian PLY file, read on demand.
+
+    Attributes:
+        path: The file.
+        count: Number of rows.
+        names: Names and numpy types of the columns.
+        layout: Names and PLY types of the columns, as a scene keeps them.
+        comments: Comment lines of the file.
+        offset: Where the first row starts, in bytes.
+        sh_degree: SH bands above this degree are left out of scenes; None keeps all.
+        axes: The axes of the file.
+    """
+
+    path: str
+    count: int
+    names: tuple[tuple[str, str], ...]
+    layout: Layout
+    comments: tuple[str, ...]
+    offset: int
+    sh_degree: int | None = None
+    axes: str = SCENE_AXES
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """The type of a row."""
+        return np.dtype(list(self.names))
+
+    def read(self, start: int, stop: int, step: int = 1) -> NDArray[Any]:
+        """Map every ``step``-th row of a range into memory; pages are read on use."""
+        place = self.offset + start * self.dtype.itemsize
+        rows = np.memmap(self.path, self.dtype, "r", place, (stop - start,)).view(np.ndarray)
+        return rows[::step]
+
+    def scene(self, rows: NDArray[Any]) -> GaussianScene:
+        """Build a scene from rows with at least the columns of the file, as a load returns it."""
+        return self.assemble([rows], len(rows))
+
+    def assemble(
+        self, parts: Iterable[NDArray[Any]], count: int, *, is_slim: bool = False
+    ) -> GaussianScene:
+        """Build a scene from ``count`` rows in several parts, as :func:`cvtgs.load` returns it.
+
+        A slim one lacks extra columns and SH bands above the constant one.
+        """
+        degree = 0 if is_slim else self.sh_degree
+        scene = assemble(
+            parts,
+            count=count,
+            layout=self.layout,
+            comments=self.comments,
+            sh_degree=degree,
+            with_extras=not is_slim,
+        )
+        scene = scene if degree is None else scene.with_sh_degree(degree)
+        return change_axes(scene, self.axes, SCENE_AXES)
+
+
+def open_rows(
+    path: str | os.PathLike[str], *, sh_degree: int | None = None, axes: str | None = None
+) -> PlyRows:
+    """Open a binary little endian PLY of a 3DGS scene, vertices first, without reading its rows.
+
+    Scenes are converted from ``axes``, by default those of PLY files, and lack the SH bands above
+    ``sh_degree``.
+    """
+    name = os.fspath(path)
+    with open_input(Path(path)) as file:
+        header = read_header(file, name)
+        size = os.fstat(file.fileno()).st_size
+    vertex = find_vertices(header, name)
+    check_size(header, vertex, path=name, size=size)
+    if not can_map(header):
+        raise FileFormatError(
+            f"{name}: only binary little endian PLY files with vertices first can be read in "
+            f"parts; write one with cvtgs convert."
+        )
+    return PlyRows(
+        path=name,
+        count=vertex.count,
+        names=tuple((prop.name, "<" + SCALARS[prop.type].code) for prop in vertex.properties),
+        layout=layout_of(vertex),
+        comments=header.comments,
+        offset=header.data_offset,
+        sh_degree=sh_degree,
+        axes=SCENE_AXES if axes is None else checked_axes(axes),
+    )

@@ -1,5 +1,9 @@
-"""Write a 3DGS scene to a PLY file, with the properties of its source where they fit."""
+"""Write scenes to PLY files, with the properties of their source where they fit; join files."""
 
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -7,9 +11,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvtgs.errors import DroppedDataWarning, InvalidSceneError, warn
-from cvtgs.io.ply.header import FLOAT_TYPES, SCALARS, Layout, header_bytes, row_dtype
-from cvtgs.io.ply.properties import dtype_of, is_standard, standard_slots
+from cvtgs.errors import DroppedDataWarning, FileFormatError, InvalidSceneError, warn
+from cvtgs.io.ply.header import (
+    FLOAT_TYPES,
+    SCALARS,
+    Layout,
+    dtype_of,
+    header_bytes,
+    is_standard,
+    row_dtype,
+    standard_slots,
+)
+from cvtgs.io.ply.read import open_rows
 from cvtgs.scene import FLAT_LOG_SCALE, NORMALS, GaussianScene
 
 CHUNK_BYTES = 1 << 20  # bytes that are gathered before they are written
@@ -40,6 +53,24 @@ def write_ply(scene: GaussianScene, file: BinaryIO) -> None:
         block = np.zeros(min(rows, len(scene) - start), dtype)
         _fill(block, scene, start)
         file.write(block.view(np.uint8).data)
+
+
+def join_plys(paths: Sequence[str | os.PathLike[str]], file: BinaryIO) -> int:
+    """Write the concatenated rows of PLY files that have the same columns, and return their number.
+
+    The comments are those of the first file. Memory is one buffer.
+    """
+    parts = [open_rows(path) for path in paths]
+    first, total = parts[0], sum(part.count for part in parts)
+    for part in parts:
+        if part.names != first.names:
+            raise FileFormatError(f"{part.path}: must have the same columns as {first.path}.")
+    file.write(header_bytes(first.comments, [("vertex", total, first.layout)]))
+    for part in parts:
+        with Path(part.path).open("rb") as content:
+            content.seek(part.offset)
+            shutil.copyfileobj(content, file, 1 << 20)
+    return total
 
 
 def _fill(block: NDArray[Any], scene: GaussianScene, start: int) -> None:
