@@ -30,7 +30,7 @@ from cvtgs.budget.calibrate import (
     undisturbed_seconds,
 )
 from cvtgs.clock import StageCost
-from cvtgs.tradeoff.runs import Task, run_task
+from cvtgs.tradeoff.measure import Task, run_task
 
 SCENES = (
     ("object", 50_000, 2),

@@ -40,16 +40,16 @@ def test_the_table_is_printed_and_the_files_are_written(source, tmp_path, capsys
 
 @pytest.mark.long
 def test_a_failed_run_is_reported_and_the_others_continue(source, tmp_path, capsys, monkeypatch):
-    from cvtgs.tradeoff import runs  # noqa: PLC0415 (patched below)
+    from cvtgs.tradeoff import measure  # noqa: PLC0415 (patched below)
 
-    real = runs.run_process
+    real = measure.run_process
 
     def fails_once(command):
         if "draft" in command:
             raise cvtgs.errors.RunError("the disk is full.")
         return real(command)
 
-    monkeypatch.setattr(runs, "run_process", fails_once)
+    monkeypatch.setattr(measure, "run_process", fails_once)
     words = ["tradeoff", str(source), "--rho", "0.1", *LOOK, "-o", str(tmp_path / "out")]
     assert main([*words, "--presets", "draft,fast", "--quiet"]) == 0
     assert capsys.readouterr().err == "cvtgs: warning: draft 0.1 failed: the disk is full.\n"

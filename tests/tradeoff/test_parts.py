@@ -36,8 +36,7 @@ from cvtgs.tradeoff.files import (
     ticks,
     tradeoff_chart,
 )
-from cvtgs.tradeoff.results import on_front, with_fronts
-from cvtgs.tradeoff.runs import (
+from cvtgs.tradeoff.measure import (
     WARNING,
     ProcessCost,
     Run,
@@ -45,6 +44,7 @@ from cvtgs.tradeoff.runs import (
     run_process,
     tasks_of,
 )
+from cvtgs.tradeoff.results import on_front, with_fronts
 from cvtgs.views import automatic_views
 
 
@@ -327,7 +327,7 @@ def test_the_size_of_a_folder_is_that_of_its_scene(tmp_path, monkeypatch):
 def test_the_child_process_ends_with_its_parent(tmp_path, number):
     note = tmp_path / "pid"
     inner = f"import os, pathlib, time; pathlib.Path({str(note)!r}).write_text(str(os.getpid()))"
-    outer = "import signal, sys; from cvtgs.tradeoff.runs import run_process;"
+    outer = "import signal, sys; from cvtgs.tradeoff.measure import run_process;"
     outer += (
         "signal.signal(signal.SIGINT, signal.default_int_handler);"  # ignored in the background
     )

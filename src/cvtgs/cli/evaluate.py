@@ -282,7 +282,7 @@ def add_tradeoff(add_parser: AddParser) -> None:
 def tradeoff(options: argparse.Namespace) -> None:
     """Run ``cvtgs tradeoff``."""
     from cvtgs.tradeoff.files import check_tradeoff_files
-    from cvtgs.tradeoff.runs import tasks_of
+    from cvtgs.tradeoff.measure import tasks_of
 
     check_view_options(options)
     presets = None if options.presets is None else read_words(options.presets)

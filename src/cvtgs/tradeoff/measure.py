@@ -1,9 +1,12 @@
-"""Measure cost and quality of every preset on one scene."""
+"""Measure cost and quality of every preset on one scene, each run in a process of its own."""
 
 import os
 import platform
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -13,16 +16,48 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
+from cvtgs.config import PRESETS, SimplifyConfig
+from cvtgs.config.simplify import unknown_preset
+from cvtgs.counts import target_count, written
 from cvtgs.devices import chosen_device, device_name
-from cvtgs.errors import RunError, warn
+from cvtgs.errors import InvalidArgumentError, RunError, warn
 from cvtgs.evaluation import Comparison, EvaluationSettings, compare
 from cvtgs.evaluation.scorer import mean_of
 from cvtgs.io import load, scene_size
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
+from cvtgs.report import SimplifyReport
 from cvtgs.scene import GaussianScene
 from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult, with_fronts
-from cvtgs.tradeoff.runs import Run, pass_warnings_on, run_task, start_seconds, tasks_of
 from cvtgs.views import automatic_views, find_own_cameras
+
+WARNING = "cvtgs: warning: "
+
+START = "import cvtgs.cli.main, cvtgs.config, cvtgs.io, cvtgs.mergenet, cvtgs.simplifier"
+"""Imports of every process before it reads a scene."""
+
+# A process inherits the peak memory of its parent, so this small launcher starts the command. On an
+# interrupt, which the child receives too, it keeps waiting for the child. When its own parent ends
+# or closes the pipe, for whatever reason, it terminates the child.
+LAUNCHER = """
+import os, signal, subprocess, sys, threading, time
+signal.signal(signal.SIGINT, lambda *_: None)
+start = time.perf_counter()
+process = subprocess.Popen(sys.argv[1:], stdin=subprocess.DEVNULL)
+def end():
+    os.read(0, 1)
+    process.terminate()
+threading.Thread(target=end, daemon=True).start()
+signal.signal(signal.SIGTERM, lambda *_: process.terminate())
+code = process.wait()
+wall = time.perf_counter() - start
+try:
+    import resource
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    user, peak = usage.ru_utime, usage.ru_maxrss
+except ImportError:
+    user = peak = 0
+sys.stdout.write(f"\\n{code} {user} {wall} {peak}\\n")
+"""
 
 STAGE = "simplify"
 RATIOS = (0.1, 0.01, 0.001)
@@ -31,6 +66,158 @@ CameraChoice = Callable[[GaussianScene], Cameras]  # function that returns the v
 
 PhotographChoice = Callable[[Cameras], Float[Tensor, "c h w 3"]]
 """Function that returns the photograph of every camera, at the size of the cameras."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProcessCost:
+    """The cost of one process, its stdout and its stderr; Windows reports no peak memory: 0."""
+
+    wall_seconds: float
+    user_seconds: float
+    peak_memory_bytes: int
+    output: str
+    errors: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """A preset and a ratio to run."""
+
+    preset: str
+    rho: float
+
+    @property
+    def name(self) -> str:
+        """Preset and ratio."""
+        return f"{self.preset} {self.rho:.15g}"
+
+    @property
+    def file_name(self) -> str:
+        """Name of the output file."""
+        return f"{self.preset}_{self.rho:.15g}.ply"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run:
+    """A finished run: its output file, the cost of its process, and the report."""
+
+    task: Task
+    path: Path
+    cost: ProcessCost
+    report: SimplifyReport
+
+
+def tasks_of(presets: Sequence[str] | None, ratios: Sequence[float]) -> tuple[Task, ...]:
+    """Check presets and ratios, and list the runs, ratio by ratio."""
+    names = list(PRESETS) if presets is None else list(presets)
+    for name in names:
+        if name not in PRESETS:
+            raise unknown_preset(name)
+    for rho in ratios:
+        target_count(1, rho)
+    numbers = [float(written(rho)) for rho in ratios]
+    tasks = tuple(Task(preset=name, rho=rho) for rho in numbers for name in names)
+    if not tasks:
+        raise InvalidArgumentError("give at least one preset and one ratio.")
+    twice = [task.name for number, task in enumerate(tasks) if task in tasks[:number]]
+    if twice:
+        raise InvalidArgumentError(
+            f"every preset and ratio must be given once, found {twice[0]} twice."
+        )
+    return tasks
+
+
+def run_task(
+    source: str | os.PathLike[str],
+    task: Task,
+    folder: Path,
+    *,
+    training: Path | None = None,
+    device: str = "auto",
+    trust_sizes: bool = False,
+) -> Run:
+    """Run one task by ``cvtgs simplify`` in its own process.
+
+    ``training`` has the cameras to whose training split presets that use images are fitted; without
+    it, these presets find their cameras themselves.
+    """
+    path, report = folder / task.file_name, folder / f".{task.file_name}.json"
+    words = ["--rho", repr(task.rho), "--preset", task.preset, "--device", device]
+    words += ["--report", str(report), "--overwrite", "--quiet"]
+    words += ["--trust-sizes"] * trust_sizes
+    if training is not None and SimplifyConfig.from_preset(task.preset).uses_images:
+        words += ["--cameras", str(training), "--split", "train"]
+    try:
+        cost = run_process(
+            [sys.executable, "-m", "cvtgs", "simplify", os.fspath(source), str(path), *words]
+        )
+        found = SimplifyReport.model_validate_json(report.read_bytes())
+    finally:
+        report.unlink(missing_ok=True)
+    return Run(task=task, path=path, cost=cost, report=found)
+
+
+def start_seconds() -> float:
+    """Measure the seconds that a process takes before it reads a scene; the first may be cold."""
+    return min(run_process([sys.executable, "-c", START]).wall_seconds for _ in range(2))
+
+
+def pass_warnings_on(errors: str, warned: set[str]) -> None:
+    """Repeat the warnings of a process, except those in ``warned``, which is updated."""
+    for line in errors.splitlines():
+        if line.startswith(WARNING) and line not in warned:
+            warned.add(line)
+            warn(line.removeprefix(WARNING))
+
+
+def run_process(command: Sequence[str]) -> ProcessCost:
+    r"""Run a command to its end and measure it.
+
+    If this call is interrupted, the process is terminated first. Lines of its output end with
+    ``\n``, and Python writes it as UTF-8, on Windows too.
+    """
+    launcher = [sys.executable, "-S", "-c", LAUNCHER, *command]
+    reading, writing = os.pipe()
+    with os.fdopen(writing, "wb") as held:
+        with os.fdopen(reading, "rb") as watched:
+            process = subprocess.Popen(
+                launcher,
+                stdin=watched,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                env={**os.environ, "PYTHONIOENCODING": "utf-8"},
+            )
+        with process:
+            try:
+                written = process.communicate()
+            except BaseException:
+                held.close()
+                process.communicate()
+                raise
+    texts = (part.decode(errors="replace") for part in written)
+    output, errors = (text.replace("\r\n", "\n") for text in texts)
+    output, _, line = output.rstrip("\n").rpartition("\n")
+    try:
+        code, user, wall, peak = (float(word) for word in line.split())
+    except ValueError:
+        raise RunError(f"{command[0]} could not be started: {_last_line(errors)}.") from None
+    if code < 0:
+        raise RunError(f"it was ended by signal {-code:.0f}; 9 often means that memory ran out.")
+    if code:
+        raise RunError(_last_line(errors) or f"it ended with exit code {code:.0f}.")
+    unit = 1 if sys.platform == "darwin" else 1024
+    return ProcessCost(
+        wall_seconds=wall,
+        user_seconds=user,
+        peak_memory_bytes=int(peak) * unit,
+        output=output,
+        errors=errors,
+    )
+
+
+def _last_line(errors: str) -> str:
+    lines = [line for line in errors.splitlines() if line.strip()]
+    return lines[-1].removeprefix("cvtgs: error: ") if lines else ""
 
 
 class Measured(NamedTuple):
