@@ -15,8 +15,8 @@ from cvtgs.analysis.analyze import visibility_cameras
 from cvtgs.cameras import Cameras
 from cvtgs.cli.main import main
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.outofcore import LocalWorkers, improve, simplify_file
-from cvtgs.outofcore.improve import cameras_of_block
+from cvtgs.outofcore import LocalWorkers, images, simplify_file
+from cvtgs.outofcore.images import cameras_of_block
 from cvtgs.rendering import contributions, render
 from refine_cases import ring
 from scenes import random_scene
@@ -156,14 +156,14 @@ def test_blocks_use_only_the_cameras_that_show_them(two_objects, tmp_path, monke
     both = torch.cat([ring(10).viewmats, below])
     cameras = replace(ring(20), viewmats=both)
     seen = {"observe": [], "refine": []}
-    for name, true in (("observe", improve.observe), ("refine", improve.refine)):
+    for name, true in (("observe", images.observe), ("refine", images.refine)):
 
         def noting(*arguments, true=true, name=name, **options):
             views = options.get("cameras") or arguments[1]
             seen[name].append(views.centers[:, 1] > 30)
             return true(*arguments, **options)
 
-        monkeypatch.setattr(improve, name, noting)
+        monkeypatch.setattr(images, name, noting)
     in_blocks(two_objects, tmp_path / "out.ply", REFINED, cameras=cameras)
     for masks in seen.values():
         assert sorted(float(mask.double().mean()) for mask in masks) == [0.0, 1.0]

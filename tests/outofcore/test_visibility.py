@@ -13,8 +13,8 @@ from cvtgs.analysis.analyze import visibility_cameras
 from cvtgs.boxes import Box, inside
 from cvtgs.io.tensors import map_tensors
 from cvtgs.outofcore import simplify_file
+from cvtgs.outofcore.images import read_apparent_rows, write_views
 from cvtgs.outofcore.rows import read_rows
-from cvtgs.outofcore.visibility import read_apparent_rows, write_views
 from cvtgs.progress import silent
 from cvtgs.rendering import contributions
 from cvtgs.scene import concatenate
@@ -80,7 +80,7 @@ def test_invalid_rows_do_not_enlarge_the_sample(scene, tmp_path):
 
 
 def test_gaussians_of_a_sample_are_enlarged_to_the_mass_of_the_scene(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("cvtgs.outofcore.visibility.visibility_cameras", lambda *_, **__: ring())
+    monkeypatch.setattr("cvtgs.outofcore.images.visibility_cameras", lambda *_, **__: ring())
     job = SimpleNamespace(config=SimplifyConfig(), cameras=None, views_path=tmp_path / "views")
     sample = scene.select(torch.arange(0, COUNT, 4))
     write_views(job, sample, total=COUNT)
@@ -112,7 +112,7 @@ def test_images_that_show_nothing_change_nothing(scene, tmp_path, monkeypatch):
     plain = SETTINGS | {"visibility": {"views": 0}}
     expected = run(scene, tmp_path / "a", SimplifyConfig.from_mapping(plain))
     monkeypatch.setattr(
-        "cvtgs.outofcore.visibility.contributions",
+        "cvtgs.outofcore.images.contributions",
         lambda scene, cameras: torch.zeros(len(scene), dtype=torch.float64),
     )
     job = run(scene, tmp_path / "b", SimplifyConfig.from_mapping(SETTINGS))

@@ -20,9 +20,9 @@ from cvtgs.errors import warn
 from cvtgs.grouping import REASSIGN, allocation_at
 from cvtgs.math.segments import segment_argmax, sort_by_label, take_columns
 from cvtgs.outofcore.halo import number_remote
+from cvtgs.outofcore.images import read_apparent_rows
 from cvtgs.outofcore.job import SENT_BYTES, Job
 from cvtgs.outofcore.rows import BlockRows, send_rows
-from cvtgs.outofcore.visibility import read_apparent_rows
 
 KEY = 1 << 32  # a global key of a cell or group is its block times this, plus its number there
 

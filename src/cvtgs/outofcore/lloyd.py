@@ -22,8 +22,8 @@ from cvtgs.outofcore.halo import (
     number_remote,
     other_blocks,
 )
+from cvtgs.outofcore.images import read_apparent_rows
 from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.visibility import read_apparent_rows
 
 
 class RemoteSums(NamedTuple):

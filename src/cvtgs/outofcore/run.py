@@ -24,7 +24,13 @@ from cvtgs.io.axes import SCENE_AXES, checked_axes
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import PlyRows, join_plys, open_rows
 from cvtgs.outofcore.allocate import allocate, join
-from cvtgs.outofcore.improve import improve, join_matchings, join_refinements
+from cvtgs.outofcore.images import (
+    add_contributions,
+    improve,
+    join_matchings,
+    join_refinements,
+    measure,
+)
 from cvtgs.outofcore.job import Job, Manifest, job_folder, started
 from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
 from cvtgs.outofcore.memory import (
@@ -40,7 +46,6 @@ from cvtgs.outofcore.merge import correct, inflate, merge, read_report, simplify
 from cvtgs.outofcore.rows import kept_rows
 from cvtgs.outofcore.scan import CHUNK
 from cvtgs.outofcore.sort import sort_into_blocks
-from cvtgs.outofcore.visibility import add_contributions, measure
 from cvtgs.prepared import check_cameras
 from cvtgs.processes import Result, Workers, with_progress
 from cvtgs.progress import ProgressListener, silent

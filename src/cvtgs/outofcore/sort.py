@@ -24,6 +24,7 @@ from cvtgs.devices import one_thread
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError, RunError
 from cvtgs.grouping import finer_count
 from cvtgs.io.atomic import replace_file, write_error
+from cvtgs.outofcore.images import write_views
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.rows import AREA, VISIBILITY, record_type
 from cvtgs.outofcore.scan import (
@@ -35,7 +36,6 @@ from cvtgs.outofcore.scan import (
     scan_range,
     scan_scene,
 )
-from cvtgs.outofcore.visibility import write_views
 from cvtgs.processes import Workers, with_progress
 from cvtgs.scene import GaussianScene
 

@@ -1,9 +1,16 @@
-"""Match finished blocks to images of the full scene and refine them, one by one.
+"""Images in blocks: contributions before cells form, then matching and refinement.
 
-In images of the full scene, only the block itself shows all of its Gaussians; the other blocks show
-their simplified ones, fixed and the same as in images of the small scene. Only the block differs.
+Contributions are measured in images of the whole scene, from the same cameras for all blocks. A
+block is rendered with all of its Gaussians; a sample of the scene, enlarged to cover the same area,
+stands for the others.
+
+Finished blocks are matched and refined one by one. In images of the full scene, only the block
+itself shows all of its Gaussians; the other blocks show their simplified ones, fixed and the same
+as in images of the small scene. Only the block differs.
 """
 
+import json
+import math
 from collections.abc import Sequence
 from functools import partial
 from statistics import mean
@@ -14,25 +21,101 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.analysis import drop_unused_bands, restore_columns
-from cvtgs.analysis.analyze import select_columns, visibility_cameras
+from cvtgs.analysis.analyze import drop_mip_tag, measured_areas, select_columns, visibility_cameras
+from cvtgs.boxes import inside
 from cvtgs.cameras import Cameras
 from cvtgs.devices import one_thread
 from cvtgs.io import load
+from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.matching import cell_contributions, match_views
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.merge import BlockCells, read_cells, read_report, write_block
-from cvtgs.outofcore.rows import kept_rows
+from cvtgs.outofcore.rows import BlockRows, kept_rows, read_rows
 from cvtgs.refinement import refine
-from cvtgs.rendering import observe
+from cvtgs.rendering import contributions, observe
 from cvtgs.report import MatchReport, RefineReport
 from cvtgs.scene import GaussianScene, concatenate
 from cvtgs.views import find_view_positions, mixed_views
+
+MEASURED = "measured.json"  # file of the sums over all blocks
+SCENE = "scene/"
 
 NEAR = 0.5  # camera positions depend on Gaussians up to this share of a block's diagonal away
 SHOWS_BLOCK = 0.1  # share of the pixels of the best camera from which one is used for a block
 MOST_SHOWN = 0.01  # largest share of an image that one Gaussian counts for in this
 LEAST_CAMERAS = 2  # a refinement trains with one camera at least, and holds out another
 LATER_SEED = 307  # added to the seed, so that views for refinement differ from those for matching
+
+
+@one_thread()
+def write_views(job: Job, sample: GaussianScene, *, total: int) -> None:
+    """Choose cameras by a sample of ``total`` Gaussians, or from given ones; write both."""
+    cameras = visibility_cameras(sample, job.config, cameras=job.cameras)
+    enlarged = sample.log_scales + 0.5 * math.log(total / len(sample))
+    tensors = sample.with_sh_degree(0).tensors() | {"log_scales": enlarged}
+    save_tensors(
+        job.views_path,
+        {
+            "viewmats": cameras.viewmats,
+            "Ks": cameras.Ks,
+            "strides": torch.tensor(cameras.strides, dtype=torch.int64),
+            "ignores_tag": torch.tensor(cameras.ignores_tag, dtype=torch.bool),
+            **add_prefix(SCENE, tensors),
+        },
+        {name: str(getattr(cameras, name)) for name in ("width", "height")},
+    )
+
+
+@one_thread()
+def measure(job: Job, block: int) -> None:
+    """Write the contributions of the Gaussians of a block, and their sums."""
+    if job.has("contributions", block):
+        return
+    scan, rows = job.read_scan(), read_rows(job, block, is_slim=True)
+    tensors, facts = map_tensors(job.views_path)
+    cameras = Cameras(
+        viewmats=tensors["viewmats"],
+        Ks=tensors["Ks"],
+        width=int(facts["width"]),
+        height=int(facts["height"]),
+        strides=tuple(tensors["strides"].tolist()),
+        ignores_tag=tuple(tensors["ignores_tag"].tolist()),
+    )
+    sample = rows.scene.with_tensors(under_prefix(SCENE, tensors), {})
+    blocks = scan.partition.blocks_of(scan.frame.contract(sample.means))
+    others = sample.select((blocks != block) | inside(job.boxes, sample.means))
+    drawn = drop_mip_tag(concatenate([rows.scene, others]), scan.plan)
+    found = contributions(drawn, cameras)[: len(rows.scene)].contiguous()
+    mass = (rows.apparent_areas * rows.scene.opacities).double().sum()
+    tensors = {"contributions": found, "pixels": found.sum(), "mass": mass}
+    job.write("contributions", block, tensors)
+
+
+def add_contributions(job: Job) -> None:
+    """Write the sums of masses and contributions over all blocks."""
+    sums = {"mass": 0.0, "pixels": 0.0}
+    for block in job.blocks_with_rows():
+        tensors = job.read("contributions", block)
+        sums = {name: total + float(tensors[name]) for name, total in sums.items()}
+    job.write_file(MEASURED, json.dumps(sums).encode())
+
+
+def read_apparent_rows(job: Job, block: int, *, is_slim: bool = True) -> BlockRows:
+    """Read rows, with the areas that images measured if there are images."""
+    rows = read_rows(job, block, is_slim=is_slim)
+    if not job.config.uses_renders:
+        return rows
+    sums = json.loads(job.path(MEASURED).read_bytes())
+    if sums["pixels"] == 0.0:
+        return rows
+    measured = measured_areas(
+        rows.apparent_areas,
+        rows.scene.opacities,
+        job.read("contributions", block)["contributions"],
+        mass_per_pixel=torch.tensor(sums["mass"] / sums["pixels"], dtype=torch.float64),
+        share=job.config.visibility.mass_share,
+    )
+    return rows._replace(apparent_areas=measured)
 
 
 class Drawn(NamedTuple):
