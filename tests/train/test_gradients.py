@@ -8,7 +8,7 @@ import torch
 
 from cvtgs.errors import TrainingError
 from cvtgs.mergenet import load_checkpoint
-from cvtgs.train import TrainConfig, TrainFiles, gradients
+from cvtgs.train import TrainConfig, TrainFiles
 from cvtgs.train import loop as train_loop
 from cvtgs.train.cache import prepare_scene
 from cvtgs.train.cases import DeviceCopies
@@ -32,15 +32,15 @@ def config_of(scenes: Path, **changes) -> TrainConfig:
     return tiny_config(tiny_data(scenes), width=6, cell_width=10, **changes)
 
 
-def cases_of(config: TrainConfig, cache: Path) -> list[gradients.CaseWithViews]:
+def cases_of(config: TrainConfig, cache: Path) -> list[train_loop.CaseWithViews]:
     sources = find_sources(config.data, seed=config.seed)
     prepared = [prepare_scene(one, config, cache) for one in sources if not one.is_validation]
     return [(case, scene.views) for scene in prepared for case in scene.cases]
 
 
-def results_of(config: TrainConfig, cache: Path, step: int = 3) -> list[gradients.CaseGradient]:
+def results_of(config: TrainConfig, cache: Path, step: int = 3) -> list[train_loop.CaseGradient]:
     cases = cases_of(config, cache)
-    with gradients.step_gradients(cases, config, cache, COPIES) as compute:
+    with train_loop.step_gradients(cases, config, cache, COPIES) as compute:
         return compute(small_net(), step)
 
 
@@ -63,7 +63,7 @@ def test_the_first_case_of_a_step_does_not_depend_on_their_number(scenes, cache)
 def test_processes_compute_what_one_does(scenes, cache, monkeypatch):
     config = config_of(scenes, cases_per_step=2)
     alone = results_of(config, cache)
-    monkeypatch.setattr(gradients, "thread_count", lambda: 2)
+    monkeypatch.setattr(train_loop, "thread_count", lambda: 2)
     together = results_of(config, cache)
     for ours, theirs in zip(alone, together, strict=True):
         assert ours.name == theirs.name
@@ -87,7 +87,7 @@ def test_a_step_follows_the_mean_gradient(scenes, cache, tmp_path, monkeypatch):
     cases = cases_of(config, cache)
     net = train_loop._first_net(config)
     net.known.fit(train_loop.summarize(case.descriptors) for case, _ in cases)
-    with gradients.step_gradients(cases, config, cache, COPIES) as compute:
+    with train_loop.step_gradients(cases, config, cache, COPIES) as compute:
         first, second = compute(net, 0)
     for gradient, one, other in zip(seen, first.gradients, second.gradients, strict=True):
         torch.testing.assert_close(gradient, (one + other) / 2)
@@ -113,12 +113,12 @@ def test_a_resumed_training_of_several_cases_gives_the_same_bits(scenes, cache, 
 
 
 def test_a_bad_loss_names_its_own_scene(scenes, cache, tmp_path, monkeypatch):
-    whole = gradients.scene_loss
+    whole = train_loop.scene_loss
 
     def spoilt(net, case, views, **options):
         loss = whole(net, case, views, **options)
         return loss * math.nan if case.scene_name == "third" else loss
 
-    monkeypatch.setattr(gradients, "scene_loss", spoilt)
+    monkeypatch.setattr(train_loop, "scene_loss", spoilt)
     with pytest.raises(TrainingError, match="third at"):
         run(config_of(scenes, cases_per_step=3, steps=20), tmp_path / "net.safetensors", cache)

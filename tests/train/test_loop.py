@@ -17,7 +17,7 @@ from cvtgs.errors import (
 )
 from cvtgs.mergenet import load_checkpoint
 from cvtgs.progress import ProgressEvent
-from cvtgs.train import Gain, History, TrainConfig, TrainFiles, gradients
+from cvtgs.train import Gain, History, TrainConfig, TrainFiles
 from cvtgs.train import loop as train_loop
 from train_cases import bits_of, run, small_scene, tiny_config, tiny_data, write_scenes
 
@@ -220,7 +220,7 @@ def test_training_stops_at_a_loss_that_is_not_finite(
     scenes, cache, tmp_path, monkeypatch, kind, bad
 ):
     name, path, calls = f"{kind}_loss", tmp_path / "net.safetensors", []
-    true_loss = getattr(gradients, name)
+    true_loss = getattr(train_loop, name)
 
     def loss(net, *arguments, **options) -> torch.Tensor:
         value = true_loss(net, *arguments, **options)
@@ -232,7 +232,7 @@ def test_training_stops_at_a_loss_that_is_not_finite(
         zero = net.decoder.bias - net.decoder.bias.detach()
         return value + zero.abs().sqrt().sum()
 
-    monkeypatch.setattr(gradients, name, loss)
+    monkeypatch.setattr(train_loop, name, loss)
     with pytest.raises(TrainingError) as caught:
         run(config_of(scenes, kind=kind), path, cache)
     assert str(caught.value) == (
@@ -245,9 +245,9 @@ def test_training_stops_at_a_loss_that_is_not_finite(
 @pytest.mark.slow
 def test_a_failed_training_can_be_resumed(scenes, cache, tmp_path, monkeypatch):
     path, whole = tmp_path / "net.safetensors", tmp_path / "whole.safetensors"
-    true_loss = gradients.scene_loss
+    true_loss = train_loop.scene_loss
     with monkeypatch.context() as patch:
-        patch.setattr(gradients, "scene_loss", lambda *a, **o: true_loss(*a, **o) * math.inf)
+        patch.setattr(train_loop, "scene_loss", lambda *a, **o: true_loss(*a, **o) * math.inf)
         with pytest.raises(TrainingError):
             run(config_of(scenes), path, cache)
     run(config_of(scenes), path, cache, resume=True)
