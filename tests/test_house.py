@@ -21,7 +21,7 @@ TEXTS = {path: path.read_text(encoding="utf-8") for path in FILES}
 LEVELS = [
     {"errors", "progress", "startup", "tags", "text"},
     {"devices", "checks"},
-    {"math", "clock", "plots", "counts", "boxes", "selection"},
+    {"math", "clock", "plots", "counts", "boxes"},
     {"config", "scene", "cameras", "processes"},
     {"validity", "edit"},
     {"io", "synthetic", "rendering", "losses"},

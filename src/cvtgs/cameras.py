@@ -10,11 +10,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.checks import check_kinds, checked
-from cvtgs.counts import check_whole, whole_number
+from cvtgs.checks import check_kinds, checked, row_numbers
+from cvtgs.counts import check_whole, spread_rows, whole_number
 from cvtgs.devices import usable_device, without_autocast
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.selection import row_numbers, spread_rows
 from cvtgs.text import shown
 
 

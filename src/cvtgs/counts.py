@@ -147,6 +147,12 @@ def shortfall(valid: int, total: int, target: int) -> str:
     return f"only {valid} of {total} Gaussians are valid" if valid < target else ""
 
 
+def spread_rows(length: int, count: int) -> tuple[int, ...]:
+    """Return ``count`` evenly spaced row numbers below a length, or all if it is shorter."""
+    count = min(count, length)
+    return tuple((k * length) // count for k in range(count))
+
+
 def shared_out(total: int, shares: Sequence[float], *, rooms: Sequence[int]) -> list[int]:
     """Split a count in proportion to shares by largest remainder, with an upper limit for each.
 

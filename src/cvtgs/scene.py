@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cvtgs.checks import row_numbers
 from cvtgs.counts import whole_number
 from cvtgs.devices import row_chunks, usable_device
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.math import parameters, spherical_harmonics
-from cvtgs.selection import row_numbers
 from cvtgs.tags import ANTIALIASED, TWO_SCALES
 from cvtgs.text import counted, shown
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.checks import check_kinds
 from cvtgs.clock import check_listener
-from cvtgs.counts import check_whole
+from cvtgs.counts import check_whole, spread_rows
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation.images import as_bytes
 from cvtgs.evaluation.scorer import (
@@ -28,7 +28,6 @@ from cvtgs.evaluation.scorer import (
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.rendering import choose_backend
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
-from cvtgs.selection import spread_rows
 from cvtgs.text import shown
 
 STAGE = "evaluate"  # stage name in progress events; one step per image
