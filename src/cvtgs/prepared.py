@@ -91,14 +91,6 @@ class Prepared:
         self._move_note = ""  # for all runs after a fallback to another device
         self._forget()
 
-    def _begin(self, device: torch.device, note: str) -> None:
-        """Begin an attempt on a device; after a failed one, release its tensors."""
-        if note:
-            self._forget()
-        if device != self._device:
-            self._device, self._move_note = device, note
-        self._device_note = note or self._move_note
-
     def _forget(self) -> None:
         """Release everything that is cached on the device."""
         self._net: Net | None = None
@@ -130,12 +122,21 @@ class Prepared:
         mask = None if keep is None else checked_mask(keep, total)
         return self._attempt(partial(self._run, target, mask))
 
-    def _attempt(self, compute: Callable[[torch.device, str], Result]) -> Result:
+    def _attempt(self, compute: Callable[[], Result]) -> Result:
         """Compute on the device, or elsewhere if it lacks memory.
 
         Gradients, inference mode and autocast are off, whatever the program has set: results do not
         depend on inputs in a differentiable way, and a refinement needs gradients of its own.
         """
+
+        def compute_on(device: torch.device, note: str) -> Result:
+            if note:  # after a failed attempt
+                self._forget()
+            if device != self._device:
+                self._device, self._move_note = device, note
+            self._device_note = note or self._move_note
+            return compute()
+
         with (
             threads_for_chunks() if self._config.uses_images else without_spinning(),
             torch.inference_mode(mode=False),
@@ -143,17 +144,14 @@ class Prepared:
             without_autocast(),
         ):
             return within_memory(
-                compute,
+                compute_on,
                 self._device,
                 work=f"simplifying {self._total:,} Gaussians",
                 may_leave=self._may_leave,
             )
 
-    def _run(
-        self, target: int, keep: Bool[Tensor, "n"] | None, device: torch.device, note: str
-    ) -> Simplified:
-        self._begin(device, note)
-        clock = StageClock(self._listener, device)
+    def _run(self, target: int, keep: Bool[Tensor, "n"] | None) -> Simplified:
+        clock = StageClock(self._listener, self._device)
         checked, analysis = self._analyze(target, clock)
         valid = checked.scene
         if keep is None or not bool(keep.any()):
@@ -186,9 +184,8 @@ class Prepared:
         """
         self._attempt(partial(self._warm_up, target_count(self._total, rho)))
 
-    def _warm_up(self, target: int, device: torch.device, note: str) -> None:
-        self._begin(device, note)
-        clock = StageClock(silent, device)
+    def _warm_up(self, target: int) -> None:
+        clock = StageClock(silent, self._device)
         checked, analysis = self._analyze(target, clock)
         self._has_run = True
         self._order(checked.scene, analysis, target, clock)
@@ -209,13 +206,10 @@ class Prepared:
         found = self._attempt(partial(self._run_levels, targets))
         return tuple(found[target] for target in targets)
 
-    def _run_levels(
-        self, targets: Sequence[int], device: torch.device, note: str
-    ) -> dict[int, Level]:
-        self._begin(device, note)
+    def _run_levels(self, targets: Sequence[int]) -> dict[int, Level]:
         found: dict[int, Level] = {}
         for target in sorted(set(targets), reverse=True):
-            clock = StageClock(self._listener, device)
+            clock = StageClock(self._listener, self._device)
             checked, analysis = self._analyze(target, clock)
             valid = checked.scene
             reduced = self._reduce(valid, analysis, target, clock)
@@ -303,9 +297,7 @@ class Prepared:
                 frozen=kept,
             )
             scene = restore_columns(matched.scene, reduced.scene, analysis.plan)
-            rows = torch.arange(len(scene), device=scene.device)
-            protected = reduced.scene.select(rows[:kept])
-            scene = concatenate([protected, scene.select(rows[kept:])]) if kept else scene
+            scene = concatenate([reduced.scene[:kept], scene[kept:]]) if kept else scene
         return reduced._replace(scene=scene, matching=matched.report)
 
     def _result(

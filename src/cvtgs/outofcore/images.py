@@ -162,8 +162,7 @@ def improve(job: Job, block: int) -> None:
             frozen=drawn.fixed,
             observed=observed if config.shares_images else None,
         )
-    rows = torch.arange(drawn.fixed, len(small))
-    improved = own.with_tensors(small.select(rows).tensors(), own.extras)
+    improved = own.with_tensors(small[drawn.fixed :].tensors(), own.extras)
     improved = restore_columns(improved, found.original, job.read_scan().plan)
     changes["mass_out"] = float(improved.masses.sum())
     report = read_report(job, block).model_copy(update=changes)
@@ -174,14 +173,14 @@ def _choose_views(job: Job, drawn: Drawn) -> tuple[Cameras | None, Cameras | Non
     """Return cameras that look at a block, given or new: for matching and for refinement."""
     config, seed = job.config, job.config.seed
     matches, refines = config.match.enabled and config.uses_renders, config.refine.enabled
-    members = drawn.full.select(torch.arange(drawn.fixed, len(drawn.full)))
+    members = drawn.full[drawn.fixed :]
     if job.cameras is not None:
         shown = cameras_of_block(job.cameras, members)
         if len(shown) < LEAST_CAMERAS:
             return None, None
         views = visibility_cameras(members, config, cameras=shown) if matches else None
         return views, shown if refines else None
-    fixed = drawn.small.select(torch.arange(drawn.fixed))
+    fixed = drawn.small[: drawn.fixed]
     own = drawn.small.means[drawn.fixed :]
     near = fixed.select(_near(fixed.means, own))
     make = partial(mixed_views, find_view_positions(concatenate([members, near])), sharp=False)
@@ -229,7 +228,7 @@ def _draw(job: Job, block: int, own: GaussianScene, found: BlockCells) -> Drawn:
         bare(load(job.small_path(other))) for other in job.blocks_with_cells() if other != block
     ]
     own, members = bare(own), bare(found.scene)
-    fixed = concatenate([*parts, own.select(torch.arange(0))])
+    fixed = concatenate([*parts, own[:0]])
     return Drawn(
         small=concatenate([fixed, own]), full=concatenate([fixed, members]), fixed=len(fixed)
     )
