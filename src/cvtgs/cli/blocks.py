@@ -37,12 +37,12 @@ def add_block_options(parser: argparse.ArgumentParser) -> None:
 
 def memory_of(options: argparse.Namespace) -> int:
     """Return the memory to use, in bytes; raise if there would be no worker."""
-    from cvtgs.outofcore.memory import available_memory, memory_to_plan, read_bytes
+    from cvtgs.outofcore.memory import memory_to_plan, read_bytes
 
     if options.workers is not None and options.workers < 1:
         raise InvalidArgumentError(f"--workers must be at least 1, found {options.workers}.")
     if options.memory is None:
-        return memory_to_plan(available_memory())
+        return memory_to_plan()
     return read_bytes(options.memory)
 
 

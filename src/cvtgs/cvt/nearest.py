@@ -60,9 +60,9 @@ def nearest_site(
         >>> labels.tolist()
         [1]
     """
-    _check_sites(sites)
     if points.device.type != "cuda":
         return nearest_scipy(points, sites)
+    _check_sites(sites)
     distinct = _one_of_each(sites)
     labels, squared = nearest_in_tiles(points, sites if distinct is None else sites[distinct])
     return labels[:, 0] if distinct is None else distinct[labels[:, 0]], squared[:, 0]

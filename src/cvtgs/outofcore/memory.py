@@ -77,12 +77,12 @@ def check_memory(memory: int | None, *, with_images: bool) -> None:
         )
 
 
-def memory_to_plan(free: int) -> int:
+def memory_to_plan() -> int:
     """Return the default memory to plan with: the free memory, but at least ``LEAST_BYTES``.
 
     Estimates are twice the actual use, so planning with less would only give more blocks.
     """
-    return max(free, LEAST_BYTES)
+    return max(available_memory(), LEAST_BYTES)
 
 
 def control_group_rooms(root: Path) -> list[int]:

@@ -35,7 +35,6 @@ from cvtgs.outofcore.job import Job, Manifest, job_folder, started
 from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
 from cvtgs.outofcore.memory import (
     IMAGE_BYTES,
-    available_memory,
     block_count,
     cell_room,
     check_memory,
@@ -139,10 +138,9 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     check_cameras(cameras, simplifier.config)
     check_save(output, overwrite=overwrite)
     rows = open_rows(source, sh_degree=sh_degree, axes=source_axes)
-    rows = replace(rows, path=str(Path(rows.path).absolute()))  # for workers in other folders
     target = target_count(rows.count, rho, count=count, max_count=max_count)
     check_memory(memory, with_images=simplifier.config.uses_images)
-    room = memory or memory_to_plan(available_memory())
+    room = memory or memory_to_plan()
     if simplifier.config.uses_images:
         room -= IMAGE_BYTES
         if cameras is not None:

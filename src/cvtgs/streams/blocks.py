@@ -26,7 +26,7 @@ from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
 from cvtgs.outofcore import Workers
 from cvtgs.outofcore.job import Job, job_folder, started
-from cvtgs.outofcore.memory import available_memory, block_count, memory_to_plan, sample_rows
+from cvtgs.outofcore.memory import block_count, memory_to_plan, sample_rows
 from cvtgs.outofcore.rows import analysis_of, read_rows
 from cvtgs.outofcore.run import check_config, rows_per_range
 from cvtgs.outofcore.sort import sort_into_blocks
@@ -207,7 +207,6 @@ def stream_file(  # noqa: PLR0913 (options by name)
     simplifier, workers = simplifier or Simplifier(device="cpu"), workers or map
     check_config(simplifier.config, with_images=False)
     rows = open_rows(source)
-    rows = replace(rows, path=str(Path(rows.path).absolute()))  # for workers in other folders
     targets = sorted({target_count(rows.count, rho) for rho in rhos}, reverse=True)
     if len(targets) < len(rhos) or not targets:
         raise InvalidArgumentError(
@@ -215,7 +214,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
             f"{rows.count:,} Gaussians."
         )
     merged = [target for target in targets if target < rows.count] or targets
-    room = memory or memory_to_plan(available_memory())
+    room = memory or memory_to_plan()
     merging = finer_count(merged[0], rows.count, simplifier.config.allocation)
     wanted = blocks or block_count(rows, room, merging=merging)
     job = Job(

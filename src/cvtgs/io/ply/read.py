@@ -352,7 +352,7 @@ def open_rows(
             f"parts; write one with cvtgs convert."
         )
     return PlyRows(
-        path=name,
+        path=str(Path(name).absolute()),  # for workers in other folders
         count=vertex.count,
         names=tuple((prop.name, "<" + SCALARS[prop.type].code) for prop in vertex.properties),
         layout=layout_of(vertex),
