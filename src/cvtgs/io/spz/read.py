@@ -166,7 +166,9 @@ def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> tuple[
         header = _header(stream.decompress(content, HEADER.size), path, versions=(1, 2, 3))
         wanted = sum(header.sizes.values())
         if not trust_sizes:
-            _check_expansion(path, header, len(content))
+            check_expansion(
+                path, count=header.count, sh_degree=header.sh_degree, stored=len(content)
+            )
         payload = stream.decompress(stream.unconsumed_tail, wanted)
         surplus = len(stream.decompress(stream.unconsumed_tail, 1))
     except zlib.error as error:
@@ -211,7 +213,7 @@ def _read_version_4(
             f"{start:,} of {len(content):,}."
         )
     if not trust_sizes:
-        _check_expansion(path, header, len(content))
+        check_expansion(path, count=header.count, sh_degree=header.sh_degree, stored=len(content))
     blocks = {"sh": np.empty(0, np.uint8)}
     at = start + TABLE_ENTRY.size * len(sizes)
     for (name, size), (packed, unpacked) in zip(
@@ -243,10 +245,6 @@ def _stated_axes(extensions: bytes, path: Path | str) -> str | None:
             axes = AXES[number - 1] if number else "rub"  # as Niantic's library takes it
         at += 8 + size
     return axes
-
-
-def _check_expansion(path: Path | str, header: SpzHeader, stored: int) -> None:
-    check_expansion(path, count=header.count, sh_degree=header.sh_degree, stored=stored)
 
 
 def _header(start: bytes, path: Path | str, *, versions: tuple[int, ...]) -> SpzHeader:
