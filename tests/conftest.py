@@ -32,7 +32,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture
 def coarse_light(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compute visibility on a grid of 16 voxels a side; 128 would take most of the test time."""
-    monkeypatch.setattr(import_module("cvtgs.analysis.visibility"), "HALF_GRID", 8)
+    monkeypatch.setattr(import_module("cvtgs.analysis.analyze"), "HALF_GRID", 8)
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.analysis import EffectPlan, analyze
-from cvtgs.analysis.analyze import select_columns
+from cvtgs.analysis.effects import select_columns
 from cvtgs.checks import checked
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record

@@ -9,7 +9,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from cvtgs.analysis import SceneAnalysis, analyze, drop_unused_bands, restore_columns
-from cvtgs.analysis.analyze import drop_mip_tag, measure_visibility, select_columns
+from cvtgs.analysis.analyze import measure_visibility
+from cvtgs.analysis.effects import drop_mip_tag, select_columns
 from cvtgs.boxes import MaskLike, check_room, checked_mask
 from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock

@@ -9,7 +9,6 @@ import torch
 
 from cvtgs import EffectPlan, GaussianScene, SimplifyConfig
 from cvtgs.analysis import plan_effects
-from cvtgs.analysis.analyze import drop_mip_tag, select_columns
 from cvtgs.analysis.effects import (
     BAND_LOSS,
     DUPLICATE_SHARE,
@@ -17,8 +16,10 @@ from cvtgs.analysis.effects import (
     UNBOUNDED_SHARE,
     band_losses,
     drawn_rows,
+    drop_mip_tag,
     duplicate_share,
     far_share,
+    select_columns,
 )
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.spherical_harmonics import REST_COUNTS, evaluate

@@ -11,6 +11,7 @@ from cvtgs import GaussianScene, Simplifier, SimplifyConfig, filters, pipeline
 from cvtgs.analysis import analyze
 from cvtgs.analysis.analyze import measure_visibility
 from cvtgs.cells import features
+from cvtgs.cvt import nearest_site
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.mergenet import MergeNet
@@ -189,13 +190,13 @@ def test_duplicates_are_searched_once(monkeypatch):
     """The result is the same, also with more cells than distinct places."""
     scene = random_scene(300).select(torch.arange(300).repeat(3))
     searched = []
-    home = import_module("cvtgs.cvt.nearest")
-    original = home.nearest_site
-    monkeypatch.setattr(
-        home,
-        "nearest_site",
-        lambda points, sites: searched.append(len(points)) or original(points, sites),
-    )
+
+    def search(points, sites):
+        searched.append(len(points))
+        return nearest_site(points, sites)
+
+    for home in ("nearest", "tessellate"):
+        monkeypatch.setattr(import_module(f"cvtgs.cvt.{home}"), "nearest_site", search)
     settings = {
         "filter": {"min_opacity": 0.0},
         "cvt": {"iterations": 1},

@@ -176,5 +176,5 @@ def test_flat_gaussians_of_a_file_with_three_scales_may_become_thick():
 
 
 def test_thick_gaussians_stay_thick(monkeypatch):
-    monkeypatch.setattr(import_module("cvtgs.analysis.analyze"), "FLAT_LOG_SCALE", None)
+    monkeypatch.setattr(import_module("cvtgs.analysis.effects"), "FLAT_LOG_SCALE", None)
     simplified(random_scene(400), "auto")

@@ -7,12 +7,7 @@ import torch
 from torch import Tensor
 
 from cvtgs.analysis import ambient_visibility
-from cvtgs.analysis.visibility import (
-    add_depths,
-    empty_depth_grid,
-    visibility_at,
-    visibility_grid,
-)
+from cvtgs.analysis.analyze import add_depths, empty_depth_grid, visibility_at, visibility_grid
 from cvtgs.math.frames import RobustFrame
 
 ORIGIN = torch.zeros(3, dtype=torch.float64)

@@ -1,5 +1,7 @@
 """Simplification on a pretended CUDA device: devices are not mixed, the CPU's bits, few waits."""
 
+from importlib import import_module
+
 import pytest
 import torch
 
@@ -141,7 +143,7 @@ def test_a_named_device_without_enough_memory_is_an_error():
 def test_short_chunks_are_used_where_long_ones_do_not_fit(monkeypatch, computed_as_on_the_cpu):
     for name in ("mergenet.apply", "cells.merge"):
         monkeypatch.setattr(f"cvtgs.{name}.CHUNK_MEMBERS", 64)
-    monkeypatch.setattr("cvtgs.analysis.visibility.HALF_GRID", 8)
+    monkeypatch.setattr(import_module("cvtgs.analysis.analyze"), "HALF_GRID", 8)
     scene = random_scene(3000, degree=0, size=0.02)
     wanted = Simplifier(device="cpu").simplify(scene, 0.02)
     # The weights of the network, 299,172 bytes, are copied at once and just fit.

@@ -1,21 +1,14 @@
 """Analysis of a scene: frame, areas, visibility, and the effects that it calls for."""
 
-from cvtgs.analysis.analyze import (
-    SceneAnalysis,
-    analyze,
-    drop_unused_bands,
-    restore_columns,
-)
+from cvtgs.analysis.analyze import SceneAnalysis, ambient_visibility, analyze, perspective_falloff
 from cvtgs.analysis.effects import (
     BandsEffect,
     Effect,
     EffectPlan,
     GradedEffect,
+    drop_unused_bands,
     plan_effects,
-)
-from cvtgs.analysis.visibility import (
-    ambient_visibility,
-    perspective_falloff,
+    restore_columns,
 )
 
 __all__ = [

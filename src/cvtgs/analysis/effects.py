@@ -1,18 +1,20 @@
-"""EffectPlan: the effects that a scene calls for, and the figures that decide."""
+"""EffectPlan: the effects that a scene calls for, the figures that decide, the columns to use."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.config import SimplifyConfig
+from cvtgs.config import EffectsConfig, SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.devices import chunk_length, row_chunks
 from cvtgs.math.parameters import MIN_ALPHA, divide, opacity_from_logit
 from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
+from cvtgs.tags import ANTIALIASED, TWO_SCALES
 
 BAND_LOSS = 1e-5
 """Bands of the spherical harmonics that together change no colour by more are dropped."""
@@ -296,3 +298,75 @@ def _hash(means: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
     x, y, z = means.contiguous().view(whole).unbind(1)
     mixed = x * 73856093 + y * 19349663 + z * 83492791  # wraps round
     return mixed ^ (mixed >> 13)
+
+
+def select_columns(scene: GaussianScene, choices: EffectsConfig) -> GaussianScene:
+    """Drop SH bands and extra columns that the configuration switches off, if there are any."""
+    if isinstance(choices.sh, int):
+        scene = scene.with_sh_degree(choices.sh)
+    if choices.extras == "off" and scene.extras:
+        scene = scene.with_tensors({}, {})
+    return scene
+
+
+def drop_unused_bands(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
+    """Drop the SH bands that a scene does not call for, and a tag mip that is switched off.
+
+    Args:
+        scene: The scene that the plan was made for.
+        plan: The effect plan.
+
+    Returns:
+        The scene with a copy of the remaining bands; the same object if nothing changes.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 10, sh_degree=2, seed=0)
+        >>> dull = scene.with_tensors({"shN": torch.zeros_like(scene.shN)}, {})
+        >>> plan = plan_effects(dull, dull.masses, distances=torch.ones(10))
+        >>> drop_unused_bands(dull, plan).sh_degree
+        0
+    """
+    return drop_mip_tag(scene.with_sh_degree(plan.sh.degree), plan)
+
+
+def drop_mip_tag(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
+    """Remove the anti-aliasing tag of a scene, if it is to be rendered without anti-aliasing."""
+    if plan.mip.active or not scene.antialiased:
+        return scene
+    return replace(scene, comments=ANTIALIASED.removed_from(scene.comments))
+
+
+def restore_columns(small: GaussianScene, scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
+    """Restore the SH degree, the comments and the flatness of the input in a small scene.
+
+    Args:
+        small: The small scene, with the bands that were computed.
+        scene: The input scene.
+        plan: The effect plan of the input scene.
+
+    Returns:
+        The small scene with the SH degree and the comments of ``scene``: dropped bands are zeros.
+        If the Gaussians of ``scene`` have two scales, third ones are negligible, unless the plan
+        makes them thick; then the tag 2dgs is left out.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 10, sh_degree=3, seed=0)
+        >>> plan = plan_effects(scene, scene.masses, distances=torch.ones(10))
+        >>> restore_columns(select_columns(scene, EffectsConfig(sh=0)), scene, plan).sh_degree
+        3
+    """
+    changes, comments = {}, scene.comments
+    missing = scene.shN.shape[1] - small.shN.shape[1]
+    if missing > 0:
+        changes["shN"] = torch.nn.functional.pad(small.shN, (0, 0, 0, missing))
+    if plan.flat.active:
+        flat = small.log_scales.clone()
+        flat[:, 2].clamp_(max=FLAT_LOG_SCALE)
+        changes["log_scales"] = flat
+    else:
+        comments = TWO_SCALES.removed_from(comments)
+    if changes:
+        small = small.with_tensors(changes)
+    return small if small.comments == comments else replace(small, comments=comments)

@@ -21,7 +21,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.analysis import drop_unused_bands, restore_columns
-from cvtgs.analysis.analyze import drop_mip_tag, measured_areas, select_columns, visibility_cameras
+from cvtgs.analysis.analyze import measured_areas, visibility_cameras
+from cvtgs.analysis.effects import drop_mip_tag, select_columns
 from cvtgs.boxes import inside
 from cvtgs.cameras import Cameras
 from cvtgs.devices import one_thread

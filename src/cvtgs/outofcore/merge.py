@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cvtgs import cells, cvt, validity
 from cvtgs.analysis import drop_unused_bands, restore_columns
-from cvtgs.analysis.analyze import select_columns
+from cvtgs.analysis.effects import select_columns
 from cvtgs.clock import StageClock
 from cvtgs.cvt.nearest import search_name
 from cvtgs.devices import one_thread

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from cvtgs.analysis import restore_columns
-from cvtgs.analysis.analyze import select_columns
+from cvtgs.analysis.effects import select_columns
 from cvtgs.boxes import Box
 from cvtgs.cameras import Cameras
 from cvtgs.clock import StageClock

@@ -16,8 +16,14 @@ from torch import Tensor
 
 from cvtgs import analysis, cells, cvt, filters, validity
 from cvtgs.analysis import EffectPlan, SceneAnalysis
-from cvtgs.analysis.analyze import apparent_areas, select_columns
-from cvtgs.analysis.visibility import add_depths, empty_depth_grid, visibility_at, visibility_grid
+from cvtgs.analysis.analyze import (
+    add_depths,
+    apparent_areas,
+    empty_depth_grid,
+    visibility_at,
+    visibility_grid,
+)
+from cvtgs.analysis.effects import select_columns
 from cvtgs.boxes import Box, inside
 from cvtgs.cells.moments import mass_unit
 from cvtgs.config import SimplifyConfig
@@ -124,7 +130,7 @@ class RangeTotals(NamedTuple):
     any division into ranges.
     """
 
-    depths: Int[Tensor, "voxels"]  # optical depths (:func:`cvtgs.analysis.visibility.add_depths`)
+    depths: Int[Tensor, "voxels"]  # optical depths (:func:`cvtgs.analysis.analyze.add_depths`)
     masses: tuple[float, ...]  # opacity times mean projected area, squared scene units
     falloff_masses: tuple[float, ...]  # the same times the perspective falloff
     far_masses: Float[Tensor, "f"]  # the same of each Gaussian beyond the distance of flyaways
@@ -149,7 +155,7 @@ class SceneScan:
 
     frame: RobustFrame
     plan: EffectPlan
-    visibility: Float[Tensor, "voxels"]  # :func:`cvtgs.analysis.visibility.visibility_grid`
+    visibility: Float[Tensor, "voxels"]  # :func:`cvtgs.analysis.analyze.visibility_grid`
     min_opacity: float  # the filter leaves out Gaussians of lower opacity,
     max_flyaway_mass: float  # and flyaways of at most this mass times falloff; -1: none
     mean_weight: float  # in the tessellation, before the floor

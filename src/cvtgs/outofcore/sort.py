@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs import analysis, cvt, filters, validity
-from cvtgs.analysis.analyze import apparent_areas, frame_of
-from cvtgs.analysis.visibility import visibility_at
+from cvtgs.analysis.analyze import apparent_areas, frame_of, visibility_at
 from cvtgs.boxes import check_room, inside
 from cvtgs.clock import StageClock
 from cvtgs.config import TessellationConfig

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from jaxtyping import Int
 from torch import Tensor
 
-from cvtgs.analysis.analyze import select_columns
+from cvtgs.analysis.effects import select_columns
 from cvtgs.clock import StageClock
 from cvtgs.counts import shared_out, target_count
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
