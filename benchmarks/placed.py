@@ -20,7 +20,7 @@ from benchmarks.cameras import beside_format, cameras_file
 from benchmarks.yards import cameras, far_surroundings
 from cvtgs import edit
 from cvtgs.scene import GaussianScene
-from cvtgs.train.sources import cut_block
+from cvtgs.train.scenes import cut_block
 from cvtgs.validity import valid_part
 from cvtgs.views.layout import find_layout
 

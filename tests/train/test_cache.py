@@ -12,8 +12,8 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.errors import OutputError
 from cvtgs.tags import ANTIALIASED
 from cvtgs.train import Source, TrainConfig, ViewsConfig
-from cvtgs.train.cache import prepare_scene
 from cvtgs.train.cases import make_case, render_targets
+from cvtgs.train.scenes import prepare_scene
 from train_cases import (
     bits_of_case,
     bits_of_views,

@@ -10,9 +10,8 @@ from cvtgs.errors import TrainingError
 from cvtgs.mergenet import load_checkpoint
 from cvtgs.train import TrainConfig, TrainFiles
 from cvtgs.train import loop as train_loop
-from cvtgs.train.cache import prepare_scene
 from cvtgs.train.cases import DeviceCopies
-from cvtgs.train.sources import find_sources
+from cvtgs.train.scenes import find_sources, prepare_scene
 from train_cases import bits_of, run, small_net, tiny_config, tiny_data, write_scenes
 
 COPIES = DeviceCopies(torch.device("cpu"))

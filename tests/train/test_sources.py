@@ -10,7 +10,7 @@ import cvtgs
 from cvtgs.errors import ConfigError, FileFormatError
 from cvtgs.tags import ANTIALIASED
 from cvtgs.train import DataConfig
-from cvtgs.train.sources import VALIDATION_SEED, cut_block, find_sources, perturb
+from cvtgs.train.scenes import VALIDATION_SEED, cut_block, find_sources, perturb
 from cvtgs.validity import invalid_rows
 from scenes import covariances_of, random_scene, same_bits
 from train_cases import small_scene, tiny_data, write_scenes

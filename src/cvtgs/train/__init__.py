@@ -2,7 +2,7 @@
 
 from cvtgs.train.config import DataConfig, LossConfig, TrainConfig, ViewsConfig
 from cvtgs.train.loop import TrainFiles, train
-from cvtgs.train.sources import Source
+from cvtgs.train.scenes import Source
 from cvtgs.train.state import Gain, History, Validation
 
 __all__ = [

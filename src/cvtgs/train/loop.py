@@ -38,11 +38,10 @@ from cvtgs.mergenet import (
 from cvtgs.mergenet.checkpoint import build_network
 from cvtgs.processes import LocalWorkers
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.train.cache import TrainingScene, prepare_scene
 from cvtgs.train.cases import Case, DeviceCopies
 from cvtgs.train.config import TrainConfig
 from cvtgs.train.losses import local_loss, published_loss, scene_loss, validation_psnr
-from cvtgs.train.sources import Source, find_sources
+from cvtgs.train.scenes import Source, TrainingScene, find_sources, prepare_scene
 from cvtgs.train.state import Gain, History, TrainState, Validation
 
 CaseWithViews = tuple[Case, tuple[ViewImages, ...]]
