@@ -244,7 +244,7 @@ def _score_images(
     scenes: Mapping[str, GaussianScene],
     cameras: Cameras,
     *,
-    photographs: Float[Tensor, "c h w 3"] | None = None,
+    photographs: Float[Tensor, "c h w 3"] | None,
     keep: Callable[[str, int, Tensor, Tensor], None] = lambda name, view, color, alpha: None,
     settings: EvaluationSettings,
     listener: ProgressListener,

@@ -175,7 +175,7 @@ def block_count(source: PlyRows, memory: int, *, merging: int = 0) -> int:
     return SHARED_BY * math.ceil(2 * wanted / room / SHARED_BY)
 
 
-def worker_count(memory: int, wanted: int | None = None) -> int:
+def worker_count(memory: int, wanted: int | None) -> int:
     """Choose the number of processes that work on blocks: one per core, if none is wanted.
 
     There is at most one per GB (1.3 GB with the CUDA build of torch), which torch and a block of

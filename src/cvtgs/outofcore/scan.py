@@ -169,7 +169,7 @@ class SceneScan:
     kept_count: int  # valid Gaussians in boxes
 
 
-def read_sample(source: PlyRows, count: int = SAMPLE_ROWS) -> GaussianScene:
+def read_sample(source: PlyRows, count: int) -> GaussianScene:
     """Read about ``count`` Gaussians at equal steps over the file; return the valid ones."""
     step = max(1, source.count // count)
     rows = step * max(1, MAPPED_ROWS // step)

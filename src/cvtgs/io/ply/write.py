@@ -55,8 +55,8 @@ def write_ply(scene: GaussianScene, file: BinaryIO) -> None:
         file.write(block.view(np.uint8).data)
 
 
-def join_plys(paths: Sequence[str | os.PathLike[str]], file: BinaryIO) -> int:
-    """Write the concatenated rows of PLY files that have the same columns, and return their number.
+def join_plys(paths: Sequence[str | os.PathLike[str]], file: BinaryIO) -> None:
+    """Write the concatenated rows of PLY files that have the same columns.
 
     The comments are those of the first file. Memory is one buffer.
     """
@@ -70,7 +70,6 @@ def join_plys(paths: Sequence[str | os.PathLike[str]], file: BinaryIO) -> int:
         with Path(part.path).open("rb") as content:
             content.seek(part.offset)
             shutil.copyfileobj(content, file, 1 << 20)
-    return total
 
 
 def _fill(block: NDArray[Any], scene: GaussianScene, start: int) -> None:

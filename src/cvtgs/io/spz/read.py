@@ -100,7 +100,7 @@ def read_spz(path: Path, *, axes: str | None = None, trust_sizes: bool = False) 
 
 
 def decode_spz(
-    content: bytes, path: Path | str, *, axes: str | None = None, trust_sizes: bool = False
+    content: bytes, path: Path | str, *, axes: str | None, trust_sizes: bool
 ) -> GaussianScene:
     """Decode the bytes of an ``.spz`` file as :func:`read_spz` does."""
     if content.startswith(_GZIP):
