@@ -13,8 +13,8 @@ from cvtgs.counts import written
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import Evaluation, SceneScores
 from cvtgs.evaluation.scorer import mean_of
-from cvtgs.io import atomic_output, check_output, check_save, load, save
-from cvtgs.io.atomic import make_folder
+from cvtgs.io import check_output, check_save, load, save
+from cvtgs.io.atomic import make_folder, write_atomically
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.report import Level
 from cvtgs.text import printable
@@ -209,5 +209,4 @@ def add_scores(index: LevelsIndex, folder: Path, evaluation: Evaluation) -> Leve
 
 
 def _write_index(index: LevelsIndex, folder: Path, *, overwrite: bool) -> None:
-    with atomic_output(folder / INDEX_NAME, overwrite=overwrite) as file:
-        file.write(index.to_json().encode())
+    write_atomically(folder / INDEX_NAME, index.to_json().encode(), overwrite=overwrite)

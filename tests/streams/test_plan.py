@@ -159,7 +159,10 @@ def test_files_hold_as_many_chunks_as_fit_or_one(counts, files):
 
 
 def test_every_block_with_rows_has_a_gaussian_at_every_level(tmp_path: Path) -> None:
-    job = SimpleNamespace(source=SimpleNamespace(count=14), path=lambda name: tmp_path / name)
+    job = SimpleNamespace(
+        source=SimpleNamespace(count=14),
+        write_file=lambda name, content: (tmp_path / name).write_bytes(content),
+    )
     share = vars(blocks)["_write_targets"]
     share(SimpleNamespace(job=job), [14, 6, 2], [12, 0, 1, 1], [12.0, 0.0, 1.0, 1.0])
     found = json.loads((tmp_path / "targets.json").read_text())["targets"]

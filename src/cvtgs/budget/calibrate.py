@@ -24,7 +24,7 @@ from cvtgs.config.base import Record
 from cvtgs.counts import target_count
 from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import OutputError
-from cvtgs.io import atomic_output
+from cvtgs.io.atomic import write_atomically
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.scene import GaussianScene
 from cvtgs.simplifier import Simplifier
@@ -172,8 +172,7 @@ def cost_model(
     record = CachedModel(version=VERSION, key=key, made=time.time(), model=model)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_output(path, overwrite=True) as file:
-            file.write(record.to_json().encode())
+        write_atomically(path, record.to_json().encode(), overwrite=True)
     except (OSError, OutputError):
         pass  # the next process measures again
     return model

@@ -21,7 +21,7 @@ from cvtgs.cli.jobs import expanded
 from cvtgs.cli.options import CAMERA_FILES, AddParser, add_options, read_words
 from cvtgs.cli.view import PAGE, check_page, write_page
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.io.atomic import windows_fault
+from cvtgs.io.atomic import windows_fault, write_atomically
 from cvtgs.progress import ProgressEvent
 from cvtgs.text import counted, printable, size_text
 
@@ -69,16 +69,15 @@ def render(options: argparse.Namespace) -> None:
     for path in paths:
         cvtgs.io.check_output(path, options.overwrite)
     with progress_bars(quiet=options.quiet) as listener, torch.no_grad():
-        for number, path in enumerate(paths):
+        for number, (path, camera) in enumerate(zip(paths, cameras.singles(), strict=True)):
             listener(ProgressEvent(stage="render", done=number, total=len(paths)))
             image = cvtgs.render(
                 scene,
-                cameras.select(torch.tensor([number])),
+                camera,
                 backend=options.backend,
                 background=background_color(options),
             ).rgb[0]
-            with cvtgs.io.atomic_output(path, overwrite=options.overwrite) as file:
-                file.write(encode(as_bytes(image), "png"))
+            write_atomically(path, encode(as_bytes(image), "png"), overwrite=options.overwrite)
         listener(ProgressEvent(stage="render", done=len(paths), total=len(paths)))
     if not options.quiet:
         images = counted(len(paths), "image")

@@ -35,6 +35,7 @@ from cvtgs.errors import (
     OutputExistsError,
     warn,
 )
+from cvtgs.io.atomic import write_atomically
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.text import counted
 
@@ -251,8 +252,7 @@ def _simplify_in_memory(
 
 def _write_report(options: argparse.Namespace, report: "SimplifyReport") -> None:
     try:
-        with cvtgs.io.atomic_output(options.report, overwrite=options.overwrite) as file:
-            file.write(report.to_json().encode())
+        write_atomically(options.report, report.to_json().encode(), overwrite=options.overwrite)
     except OSError as error:
         if not isinstance(error, OutputError | OutputExistsError):
             raise

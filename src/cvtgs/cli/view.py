@@ -10,6 +10,7 @@ from cvtgs.cli.display import say
 from cvtgs.cli.jobs import expanded
 from cvtgs.cli.options import PRESET_NAMES, AddParser, add_options, file, ratio
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.io.atomic import write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -80,8 +81,7 @@ def write_page(options: argparse.Namespace, scenes: "Mapping[str, GaussianScene]
     if not options.viewer:
         return
     path = options.output / PAGE
-    with cvtgs.io.atomic_output(path, overwrite=options.overwrite) as file:
-        file.write(scene_page(scenes).encode())
+    write_atomically(path, scene_page(scenes).encode(), overwrite=options.overwrite)
     if not options.quiet:
         say(f"{path}: {len(scenes)} scenes in 3D, in one file that works offline.")
 
@@ -108,8 +108,7 @@ def view(options: argparse.Namespace) -> None:
     try:
         if options.page is not None:
             server.finish()
-            with cvtgs.io.atomic_output(options.page, overwrite=options.overwrite) as file:
-                file.write(server.page().encode())
+            write_atomically(options.page, server.page().encode(), overwrite=options.overwrite)
             if not options.quiet:
                 say(f"{options.page}: {len(viewer.scenes)} scenes; open it in a browser.")
             return

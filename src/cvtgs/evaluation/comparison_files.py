@@ -26,8 +26,8 @@ from cvtgs.evaluation.images import (
     resized,
 )
 from cvtgs.evaluation.scorer import SceneScores
-from cvtgs.io import atomic_output, check_output
-from cvtgs.io.atomic import make_folder
+from cvtgs.io import check_output
+from cvtgs.io.atomic import make_folder, write_atomically
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.text import counted, size_text
 
@@ -102,8 +102,7 @@ def write_comparison(
     paths = tuple(Path(folder) / name for name in makers)
     for done, (path, make) in enumerate(zip(paths, makers.values(), strict=True), start=1):
         content = make()
-        with atomic_output(path, overwrite=overwrite) as file:
-            file.write(content)
+        write_atomically(path, content, overwrite=overwrite)
         listener(ProgressEvent(stage=STAGE, done=done, total=len(makers)))
     return paths
 

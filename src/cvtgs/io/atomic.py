@@ -146,6 +146,12 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
                 temporary.unlink(missing_ok=True)
 
 
+def write_atomically(path: str | os.PathLike[str], content: bytes, *, overwrite: bool) -> None:
+    """Write the whole content of a file as :func:`atomic_output` does."""
+    with atomic_output(path, overwrite=overwrite) as file:
+        file.write(content)
+
+
 def make_folder(folder: str | os.PathLike[str]) -> None:
     """Create a folder to write to, unless it exists."""
     try:

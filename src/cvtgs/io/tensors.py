@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from cvtgs.errors import FileFormatError, InputNotFoundError
-from cvtgs.io.atomic import atomic_output
+from cvtgs.io.atomic import write_atomically
 
 
 def pack_tensors(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
@@ -46,8 +46,7 @@ def save_tensors(
     path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
 ) -> None:
     """Write tensors to a file atomically; an existing file is replaced."""
-    with atomic_output(path, overwrite=True) as file:
-        file.write(pack_tensors(tensors, metadata))
+    write_atomically(path, pack_tensors(tensors, metadata), overwrite=True)
 
 
 def map_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -22,7 +22,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.errors import CvtgsError, OutputError, reason_of
-from cvtgs.io import atomic_output
+from cvtgs.io.atomic import write_atomically
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.locks import hidden_path
 from cvtgs.io.ply import PlyRows, open_rows
@@ -120,8 +120,7 @@ class Job:
 
     def write_file(self, name: str, content: bytes) -> None:
         """Write a file of the job, completely or not at all."""
-        with atomic_output(self.path(name), overwrite=True) as file:
-            file.write(content)
+        write_atomically(self.path(name), content, overwrite=True)
 
     @property
     def views_path(self) -> Path:

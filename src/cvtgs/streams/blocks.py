@@ -19,7 +19,7 @@ from cvtgs.counts import shared_out, target_count
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn
 from cvtgs.grouping import finer_count
-from cvtgs.io import atomic_output, change_axes
+from cvtgs.io import change_axes
 from cvtgs.io.atomic import make_folder
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.locks import output_lock
@@ -293,8 +293,8 @@ def _write_targets(
         least = sum(1 for room in rooms if room)
         rooms = shared_out(max(least, min(target, sum(rooms))), cells, rooms=rooms)
         levels.append(rooms)
-    with atomic_output(spec.job.path("targets.json"), overwrite=True) as file:
-        file.write(json.dumps({"targets": list(zip(*levels, strict=True))}).encode())
+    content = json.dumps({"targets": list(zip(*levels, strict=True))})
+    spec.job.write_file("targets.json", content.encode())
 
 
 @one_thread()
@@ -321,5 +321,4 @@ def write_block(spec: StreamJob, block: int) -> None:
         levels = [level._replace(scene=change_axes(level.scene, *spec.axes)) for level in levels]
     plan = plan_part(levels, near, chunk_gaussians=spec.chunk_gaussians)
     part = spec.form.write_part(plan, spec.folder, part=block, listener=silent)
-    with atomic_output(spec.part_path(block), overwrite=True) as file:
-        file.write(part.model_dump_json().encode())
+    job.write_file(spec.part_path(block).name, part.model_dump_json().encode())

@@ -21,8 +21,8 @@ from cvtgs.errors import (
     reason_of,
     warn,
 )
-from cvtgs.io import atomic_output, check_output
-from cvtgs.io.atomic import make_folder, replace_file
+from cvtgs.io import check_output
+from cvtgs.io.atomic import make_folder, replace_file, write_atomically
 from cvtgs.io.limits import phrases
 from cvtgs.io.locks import hidden_path
 from cvtgs.progress import ProgressListener
@@ -130,8 +130,7 @@ def write_stream(
 def write_index(form: StreamFormat, parts: Sequence[StreamPart], folder: Path) -> None:
     """Write the index of the parts in a folder."""
     content = json.dumps(form.index(parts, folder), separators=(",", ":"))
-    with atomic_output(folder / INDEX_NAMES[form.kind], overwrite=True) as file:
-        file.write(content.encode())
+    write_atomically(folder / INDEX_NAMES[form.kind], content.encode(), overwrite=True)
 
 
 def warn_of_losses(parts: Sequence[StreamPart], place: Path) -> None:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from cvtgs.boxes import Corner
 from cvtgs.devices import on_host
-from cvtgs.io import atomic_output, load, save
-from cvtgs.io.atomic import make_folder
+from cvtgs.io import load, save
+from cvtgs.io.atomic import make_folder, write_atomically
 from cvtgs.io.limits import FORMAT_LIMITS, dropped_within
 from cvtgs.io.sog import encode_sog
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
@@ -167,8 +167,7 @@ def _write_sog(scene: GaussianScene, folder: Path) -> int:
     make_folder(folder)
     total = 0
     for name, content in encode_sog(scene).files():
-        with atomic_output(folder / name, overwrite=True) as file:
-            file.write(content)
+        write_atomically(folder / name, content, overwrite=True)
         total += len(content)
     return total
 

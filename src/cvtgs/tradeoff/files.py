@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from cvtgs.errors import MissingDependencyError
 from cvtgs.evaluation.comparison_files import PAGE, comparison_page, render_template
-from cvtgs.io import atomic_output, check_output
-from cvtgs.io.atomic import make_folder
+from cvtgs.io import check_output
+from cvtgs.io.atomic import make_folder, write_atomically
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.text import counted, size_text
@@ -123,8 +123,7 @@ def write_tradeoff(
     }
     kept = {Path(folder) / name: content for name, content in contents.items() if content}
     for done, (path, content) in enumerate(kept.items(), start=1):
-        with atomic_output(path, overwrite=overwrite) as file:
-            file.write(content)
+        write_atomically(path, content, overwrite=overwrite)
         listener(ProgressEvent(stage=STAGE, done=done, total=len(kept)))
     return Written(tuple(kept), note)
 

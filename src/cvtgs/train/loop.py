@@ -23,8 +23,7 @@ from cvtgs.errors import (
     TrainingError,
 )
 from cvtgs.evaluation.scorer import ViewImages
-from cvtgs.io import atomic_output
-from cvtgs.io.atomic import make_folder
+from cvtgs.io.atomic import make_folder, write_atomically
 from cvtgs.mergenet import (
     Architecture,
     CheckpointInfo,
@@ -355,8 +354,7 @@ def _validate(
         curves = history.curves()
     except MissingDependencyError:
         return  # do not lose hours of training for a plot
-    with atomic_output(files.curves, overwrite=True) as file:
-        file.write(curves)
+    write_atomically(files.curves, curves, overwrite=True)
 
 
 def _restore_checkpoint(state: TrainState, config: TrainConfig, files: TrainFiles) -> None:
@@ -385,5 +383,4 @@ def _write_checkpoint(state: TrainState, config: TrainConfig, files: TrainFiles)
         start=state.start,
         scenes=state.scenes,
     )
-    with atomic_output(files.checkpoint, overwrite=True) as file:
-        file.write(save_checkpoint(state.mean_net, info))
+    write_atomically(files.checkpoint, save_checkpoint(state.mean_net, info), overwrite=True)
