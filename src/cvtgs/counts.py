@@ -1,4 +1,4 @@
-"""The number of Gaussians to keep: parsing ratios and counts, and splitting a count."""
+"""Counts of Gaussians: parsed from ratios and texts, checked, split, and spread over rows."""
 
 import math
 import operator
