@@ -186,6 +186,7 @@ def test_reports_are_joined():
         ({"steps": 2.5}, InvalidArgumentError, "a whole number above 0, found 2.5."),
         ({"steps": True}, InvalidArgumentError, "a whole number above 0, found True."),
         ({"cameras": ring(1)}, InvalidArgumentError, "at least 2 cameras, one of them to be held"),
+        ({"cameras": ring(0)}, InvalidArgumentError, "one of them to be held out; found 0."),
         ({"device": "abacus"}, DeviceError, "device 'abacus' cannot be used here"),
     ],
 )
@@ -194,6 +195,13 @@ def test_bad_arguments_are_refused(options, error, text):
     with pytest.raises(error) as caught:
         refine(full, full, **options)
     assert text in str(caught.value)
+
+
+def test_a_single_camera_is_refused_at_once_beside_existing_images():
+    full = full_scene(50)
+    observed = cvtgs.rendering.observe(full, ring(4))
+    with pytest.raises(InvalidArgumentError, match="at least 2 cameras"):
+        refine(full, full, cameras=ring(1), observed=observed)
 
 
 def test_cameras_that_miss_the_scene_are_refused():

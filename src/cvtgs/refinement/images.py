@@ -11,7 +11,6 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.config import RefineConfig
-from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation.scorer import ViewImages, render_views
 from cvtgs.losses import SSIM_WINDOW
 from cvtgs.rendering import ObservedViews
@@ -53,12 +52,7 @@ def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> 
 
 
 def split_views(cameras: Cameras, *, config: RefineConfig, seed: int) -> RefineViews:
-    """Split given cameras into evenly spread held-out views and training views."""
-    if len(cameras) < 2:
-        raise InvalidArgumentError(
-            f"a refinement needs at least 2 cameras, one of them to be held out; found "
-            f"{len(cameras)}."
-        )
+    """Split given cameras, at least 2, into evenly spread held-out views and training views."""
     side = min(config.size, max(cameras.width, cameras.height))
     sized = cameras.fitted(side, least=SSIM_WINDOW * config.stride)
     views = sized.in_two_sizes(config.fine_factor).singles()

@@ -118,6 +118,11 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     ours, theirs = _on_device(small, full, place)
     if cameras is not None:
         cameras = checked_cameras(cameras).in_both_modes()
+        if len(cameras) < 2:
+            raise InvalidArgumentError(
+                f"a refinement needs at least 2 cameras, one of them to be held out; found "
+                f"{len(cameras)}."
+            )
         check_seen(theirs, cameras, name="the full scene")
     clock = StageClock(listener, place)
     # The program may have disabled gradients, or be in inference mode or autocast.
