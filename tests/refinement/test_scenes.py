@@ -204,6 +204,14 @@ def test_a_single_camera_is_refused_at_once_beside_existing_images():
         refine(full, full, cameras=ring(1), observed=observed)
 
 
+def test_a_single_existing_image_is_not_used():
+    full, cameras = full_scene(50), ring(2)
+    options = {"steps": 2, "cameras": cameras, "config": quick(), "device": "cpu"}
+    observed = cvtgs.rendering.observe(full, cameras.select([0]))
+    found = refine(discolored(full), full, observed=observed, **options)
+    assert same_bits(found.scene, refine(discolored(full), full, **options).scene)
+
+
 def test_cameras_that_miss_the_scene_are_refused():
     """As for scores: otherwise the scene would seem perfect, and nothing would be refined."""
     full, cameras = full_scene(200), ring(4)

@@ -81,7 +81,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
             for scenes on the CPU. The result is on the device of the small scene.
         frozen: Number of Gaussians at the start of the scene that stay bit for bit.
         observed: Existing images of the full scene, with the size and stride of the configuration.
-            They are used first; as many are held out as of cameras.
+            They are used first; as many are held out as of cameras. A single one is not used, since
+            it could only be held out.
         listener: Called after every step, with the gain so far as its note.
 
     Returns:
@@ -133,7 +134,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         torch.enable_grad(),
         clock.stage(STAGE, limits.total),
     ):
-        if observed is not None:
+        if observed is not None and len(observed.cameras) > 1:
             views = shared_views(observed, theirs, cameras, config=config, seed=seed)
         elif cameras is None:
             views = generated_views(theirs, config=config, seed=seed)
