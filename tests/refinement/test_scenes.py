@@ -13,6 +13,7 @@ from cvtgs.progress import ProgressEvent
 from cvtgs.refinement import RefineConfig, refine
 from cvtgs.refinement.images import generated_views
 from cvtgs.refinement.refine import join_reports
+from pretended_device import pretended_cuda
 from refine_cases import discolored, full_scene, quick, ring, small_scene
 from scenes import same_bits
 
@@ -210,6 +211,17 @@ def test_a_single_existing_image_is_not_used():
     observed = cvtgs.rendering.observe(full, cameras.select([0]))
     found = refine(discolored(full), full, observed=observed, **options)
     assert same_bits(found.scene, refine(discolored(full), full, **options).scene)
+
+
+def test_images_and_cameras_may_be_on_other_devices_than_the_scene():
+    full = full_scene(20, degree=0)
+    observed = cvtgs.rendering.observe(full, ring(9))
+    config = quick(images_per_step=4, steps_per_image=2)
+    with pretended_cuda():
+        options = {"observed": observed, "cameras": ring(20).to("cuda"), "config": config}
+        scene, report = refine(discolored(full), full, steps=1, **options)
+    assert (report.device, scene.device.type) == ("cuda:0", "cpu")
+    assert report.images == 2
 
 
 def test_cameras_that_miss_the_scene_are_refused():

@@ -72,12 +72,14 @@ def shared_views(
     seed: int,
 ) -> RefineViews:
     """Split existing images like :func:`split_views`; further training views are new ones."""
-    whole = ViewImages(cameras=observed.cameras, rgb=observed.rgb, alpha=observed.alpha)
+    rgb, alpha = observed.rgb.to(full.device), observed.alpha.to(full.device)
+    whole = ViewImages(cameras=observed.cameras, rgb=rgb, alpha=alpha)
     images = [whole.select(row) for row in range(len(observed.cameras))]
     held = _heldout_rows(len(images), config)
+    further = _further(observed.cameras, full, cameras, config=config, seed=seed)
     return RefineViews(
         heldout=(),
-        training=_further(observed.cameras, full, cameras, config=config, seed=seed),
+        training=(view.to(observed.cameras.viewmats.device) for view in further),
         endless=cameras is None,
         heldout_images=tuple(images[row] for row in held),
         images=tuple(image.half() for row, image in enumerate(images) if row not in held),
