@@ -244,6 +244,14 @@ def test_autocast_does_not_move_cameras():
         assert torch.equal(look_at(eyes, eyes + 1, up), wanted)
 
 
+def test_autocast_changes_neither_centres_nor_what_is_seen():
+    cameras = ring(4)
+    wanted = cameras.centers
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(cameras.centers, wanted)
+        assert not Cameras(**GOOD).shows_any(torch.tensor([[4.005, 1.0, 1.0]]))
+
+
 def test_joined_cameras_keep_what_each_is_like():
     one, two = ring(2), ring(3).every(2, first=(0, 0))
     assert join_cameras([one, one]).strides == ()

@@ -88,6 +88,7 @@ class Cameras:
         return self.names or tuple(f"view {number}" for number in range(1, len(self) + 1))
 
     @property
+    @without_autocast()
     def centers(self) -> Float[Tensor, "c 3"]:
         """Positions of the cameras in the world."""
         rotations, shifts = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3:]
@@ -281,6 +282,7 @@ class Cameras:
         modes = tuple(math.sqrt(2.0) * row % 1.0 < 1 / 3 for row in range(1, len(self) + 1))
         return replace(self, ignores_tag=modes)
 
+    @without_autocast()
     @checked
     def shows_any(self, points: Float[Tensor, "n 3"]) -> bool:
         """Check whether any point lies within any of the images.
