@@ -215,7 +215,7 @@ def test_random_backgrounds_take_black_paint_from_an_empty_background(monkeypatc
     assert after[empty].mean() < before[empty].mean()
 
 
-@pytest.mark.parametrize("log_scale", [44.5, 88.0])
+@pytest.mark.parametrize("log_scale", [44.5, 88.0, 88.7])
 def test_huge_gaussians_have_finite_units(log_scale):
     scene = small_scene(full_scene())
     log_scales = scene.log_scales.clone()

@@ -276,9 +276,9 @@ def _units(scene: GaussianScene, scale: Float[Tensor, "n"]) -> dict[str, Tensor]
     axis as a ball, and much less across it.
     """
     axes = torch.where((scale > 0)[:, None], torch.exp(scene.log_scales), 0.0)
+    axes = axes.clamp_max(_LARGEST)  # their products must not overflow
     axes = torch.maximum(axes, THINNEST * axes.mean(dim=1, keepdim=True))
-    finite = axes.clamp_max(_LARGEST)  # their products must not overflow
-    first, second = finite[:, [1, 2, 0]], finite[:, [2, 0, 1]]
+    first, second = axes[:, [1, 2, 0]], axes[:, [2, 0, 1]]
     squares = (first.square() - second.square()).abs()
     turns = (first * second / squares.clamp_min(1e-30)).clamp_max(1.0)
     units = {name: _like(scale, tensor) for name, tensor in scene.tensors().items()}
