@@ -177,6 +177,7 @@ def _rasterize_all(
         width=cameras.width,
         height=cameras.height,
         near_plane=NEAR_PLANE,
+        far_plane=torch.finfo(torch.float32).max,  # none: the default would cut off large scenes
         eps2d=DILATION / max(cameras.strides, default=1) ** 2,
         sh_degree=sh_degree or None,
         packed=False,

@@ -1,0 +1,44 @@
+"""The gsplat backend, with a stand-in for gsplat: large distances and large sets of images."""
+
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+import gsplat_stand_in
+from cvtgs.rendering import gsplat_backend, torch_backend
+from render_cases import around
+from scenes import random_scene
+
+
+@pytest.fixture(autouse=True)
+def installed(monkeypatch):
+    """Install the stand-in, and return the numbers of cameras that it has rendered at once."""
+    together = []
+
+    def rasterization(**options):
+        together.append(len(options["viewmats"]))
+        return gsplat_stand_in.rasterization(**options)
+
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
+    return together
+
+
+def images(scene, cameras):
+    """Return the images of both backends."""
+    backends = gsplat_backend, torch_backend
+    return [backend.rasterize(scene, cameras, sh_degree=0).rgb for backend in backends]
+
+
+@pytest.mark.parametrize("scale", [1e-1, 1e9, 1e12])
+def test_scenes_of_any_size_are_drawn(scale):
+    scene, cameras = random_scene(20, seed=5), around(2)
+    log_scales = scene.log_scales + torch.tensor(scale).log()
+    large = scene.with_tensors({"means": scale * scene.means, "log_scales": log_scales}, {})
+    viewmats = cameras.viewmats.clone()
+    viewmats[:, :3, 3] *= scale
+    found, wanted = images(large, replace(cameras, viewmats=viewmats))
+    assert float(wanted.amax()) > 0.5
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-3)
