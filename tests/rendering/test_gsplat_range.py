@@ -42,3 +42,11 @@ def test_scenes_of_any_size_are_drawn(scale):
     found, wanted = images(large, replace(cameras, viewmats=viewmats))
     assert float(wanted.amax()) > 0.5
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-3)
+
+
+def test_a_camera_far_away_does_not_blur_the_images_of_others():
+    cameras = around(3)
+    viewmats = cameras.viewmats.clone()
+    viewmats[2, 2, 3] += 1e7
+    found, wanted = images(random_scene(20, seed=5), replace(cameras, viewmats=viewmats))
+    torch.testing.assert_close(found[:2], wanted[:2], rtol=0, atol=1e-3)

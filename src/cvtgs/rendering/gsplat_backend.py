@@ -188,14 +188,15 @@ def _rasterize_all(
 
 
 def _about_cameras(scene: GaussianScene, cameras: Cameras) -> tuple[Tensor, Tensor, Tensor]:
-    """Return means and view matrices relative to the mean camera position, and intrinsics.
+    """Return means and view matrices relative to the median camera position, and intrinsics.
 
-    gsplat works in float32, which is too coarse for positions far from the origin. What concerns
-    cameras alone is computed on the host.
+    gsplat works in float32, which is too coarse for positions far from the origin; a mean would be
+    far from all cameras if one of them is far away. What concerns cameras alone is computed on the
+    host.
     """
     viewmats, intrinsics = to_matrices(cameras)
     rotations, count = viewmats[:, :3, :3], len(cameras)
-    middle = -(rotations.mT @ viewmats[:, :3, 3:]).mean(dim=0)[:, 0]
+    middle = -(rotations.mT @ viewmats[:, :3, 3:])[:, :, 0].median(dim=0).values
     viewmats[:, :3, 3] += rotations @ middle
     table = torch.cat([middle, viewmats.flatten(), intrinsics.flatten()])
     table = table.to(scene.device, non_blocking=True)  # or the host would wait for earlier images
