@@ -50,3 +50,12 @@ def test_a_camera_far_away_does_not_blur_the_images_of_others():
     viewmats[2, 2, 3] += 1e7
     found, wanted = images(random_scene(20, seed=5), replace(cameras, viewmats=viewmats))
     torch.testing.assert_close(found[:2], wanted[:2], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(("pixels", "groups"), [(2 * 37 * 29, [2, 1]), (37 * 29 - 1, [1, 1, 1])])
+def test_few_pixels_are_rendered_at_once(installed, monkeypatch, pixels, groups):
+    monkeypatch.setattr(gsplat_backend, "PIXELS_TOGETHER", pixels)
+    scene, cameras = random_scene(5), around(3)
+    gsplat_backend.rasterize(scene, cameras, sh_degree=0)
+    list(gsplat_backend.contributions(scene, cameras))
+    assert installed == 2 * groups

@@ -31,6 +31,8 @@ from cvtgs.scene import GaussianScene
 TOGETHER = 1 << 22
 """Largest number of Gaussians that are rendered at once, counted once for every camera."""
 
+PIXELS_TOGETHER = 1 << 22  # largest number of pixels that are rendered at once
+
 PROBE_TOLERANCE = 0.02
 """Largest error of the probe's image and gradient, relative to their largest value.
 
@@ -66,7 +68,8 @@ def rasterize(
 ) -> RasterOutput:
     """Render with gsplat, in float32, several cameras at once if they treat pixels alike.
 
-    Memory: that of gsplat for :data:`TOGETHER` Gaussians or one camera, and the images.
+    Memory: that of gsplat for :data:`TOGETHER` Gaussians and :data:`PIXELS_TOGETHER` pixels, or
+    for one camera, and the images.
     """
     listener(ProgressEvent(stage=STAGE, done=0, total=len(cameras)))
     if len(scene) and len(cameras):
@@ -91,7 +94,7 @@ def rasterize(
 def contributions(scene: GaussianScene, cameras: Cameras) -> Iterator[Float[Tensor, "n"]]:
     """Yield contributions, as gradients of summed images with respect to a colour per camera.
 
-    Memory: as for images, with their gradients.
+    Memory: that of gsplat as for images, with gradients.
     """
     if len(scene) == 0 or len(cameras) == 0:
         to_matrices(cameras)  # checks them
@@ -140,7 +143,8 @@ def _alike(scene: GaussianScene, cameras: Cameras) -> list[list[int]]:
         stride = cameras.strides[row] if cameras.strides else 1
         ignores_tag = scene.antialiased and bool(cameras.ignores_tag) and cameras.ignores_tag[row]
         alike.setdefault((stride, ignores_tag), []).append(row)
-    most = max(1, TOGETHER // len(scene))
+    most = min(TOGETHER // len(scene), PIXELS_TOGETHER // (cameras.width * cameras.height))
+    most = max(1, most)
     return [
         rows[start : start + most] for rows in alike.values() for start in range(0, len(rows), most)
     ]

@@ -62,7 +62,8 @@ def render(
     contribute nothing. Autocast of torch has no effect.
 
     Memory: each backend's ``rasterize`` states its formula. Cameras are rendered one by one, by
-    ``numba`` without gradients up to four at a time.
+    ``numba`` without gradients up to four at a time, by ``gsplat`` as many as have four million
+    pixels together.
 
     Args:
         scene: The Gaussians, or a file or folder of them. Images get the scene's device and dtype.
@@ -126,7 +127,8 @@ def contributions(
     ``T`` is the transmittance in front of the Gaussian (Kerbl et al. 2023, equation 3). Colours do
     not matter. The contributions of all Gaussians add up to the summed alpha of the images.
 
-    Memory: that of rendering up to four images with ``numba``, else of one with its gradient.
+    Memory: that of rendering up to four images with ``numba``, else of one with its gradient; with
+    ``gsplat`` of as many as have four million pixels together.
 
     Args:
         scene: The Gaussians.
