@@ -12,6 +12,7 @@ from cvtgs.cameras import Cameras, look_at
 from cvtgs.math import parameters
 from cvtgs.math.frames import RobustFrame
 from cvtgs.refinement.images import generated_views
+from cvtgs.rendering.render import contributions_to_each
 from cvtgs.views import automatic_views, find_view_positions, mixed_views, random_views
 from cvtgs.views.automatic import inside_candidates
 from cvtgs.views.layout import find_layout, hidden_share
@@ -193,6 +194,20 @@ def test_an_image_that_shows_nothing_counts_all_splats():
     camera = from_two_away(focal=50.0, side=32)
     sizes = measure_splats(blobs(means, widths.float().log()), widths, 2.0, camera)
     assert bool(torch.stack(sizes).isfinite().all())
+
+
+def test_splats_are_measured_without_autocast(monkeypatch):
+    """Projections of the torch backend would have 8 bits."""
+    cameras = from_two_away(focal=50.0, side=32)
+    layout = find_layout(blobs(sphere(50), torch.full((50,), -3.0)))
+
+    def found(scene, cameras):
+        assert not torch.is_autocast_enabled("cpu")
+        return contributions_to_each(scene, cameras, backend="torch")
+
+    monkeypatch.setattr("cvtgs.views.scoring.contributions_to_each", found)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert bool(splat_sizes(layout, cameras).in_image.isfinite().all())
 
 
 def test_every_fourth_gaussian_shows_nearly_the_same_sizes(monkeypatch):
