@@ -157,6 +157,14 @@ def test_the_constructor_starts_from_the_preset(name):
             "cvt.iterations: input should be greater than or equal to 0, found -1.",
         ),
         (
+            {"match": {"color_ridge": 1e39}},
+            "match.color_ridge: input should be less than or equal to 1000000000, found 1e+39.",
+        ),
+        (
+            {"match": {"band_ridge": 1e-45}},
+            "match.band_ridge: input should be greater than or equal to 0.000000001, found 1e-45.",
+        ),
+        (
             {"filter": {"min_opacity": 1.5}},
             "filter.min_opacity: input should be less than or equal to 1, found 1.5.",
         ),

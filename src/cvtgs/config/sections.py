@@ -9,6 +9,7 @@ from cvtgs.config.base import Section
 Share = Annotated[float, pydantic.Field(ge=0.0, le=1.0)]
 Rate = Annotated[float, pydantic.Field(ge=0.0)]
 Count = Annotated[int, pydantic.Field(ge=1)]
+Ridge = Annotated[float, pydantic.Field(ge=1e-9, le=1e9)]  # products of two fit into float32
 Choice = Literal["auto", "on", "off"]
 Less = Literal["auto", "off"]
 
@@ -191,8 +192,8 @@ class MatchConfig(Section):
 
     opacity_rounds: int = pydantic.Field(default=0, ge=0)
     color_iterations: int = pydantic.Field(default=0, ge=0)
-    color_ridge: float = pydantic.Field(default=0.25, gt=0.0)
-    band_ridge: float = pydantic.Field(default=8.0, gt=0.0)
+    color_ridge: Ridge = 0.25
+    band_ridge: Ridge = 8.0
 
     @property
     def enabled(self) -> bool:
