@@ -1,6 +1,7 @@
 """Refinement of hard scenes: hidden, invalid, single, infinite; gradients that are not finite."""
 
 import math
+from functools import partial
 from importlib import import_module
 
 import numpy as np
@@ -15,6 +16,7 @@ from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.refinement import refine
 from cvtgs.refinement.images import ImageBuffer
 from cvtgs.refinement.optimize import SceneOptimizer
+from cvtgs.rendering import choose_backend
 from cvtgs.scene import concatenate
 from refine_cases import as_dtype, discolored, full_scene, quick, ring, small_scene
 from scenes import random_scene, same_bits
@@ -58,6 +60,24 @@ def test_invalid_rows_stay_and_do_no_harm():
     rows = torch.arange(3)
     assert same_bits(scene.select(rows), small.select(rows))
     assert cvtgs.validity.invalid_rows(scene.select(torch.arange(3, 500))) == {}
+
+
+@pytest.mark.parametrize("name", ["sh0", "shN"])
+def test_a_colour_that_is_no_number_does_no_harm(monkeypatch, name):
+    """The torch backend spreads it over a part of every image."""
+    torch_backend = partial(choose_backend, "torch")
+    module = import_module("cvtgs.rendering.render")
+    monkeypatch.setattr(module, "choose_backend", lambda _, device: torch_backend(device))
+    full = full_scene(60)
+    colors = discolored(full).tensors()[name].clone()
+    colors[7] = math.nan
+    small = discolored(full).with_tensors({name: colors}, {})
+    scene, report = refine(
+        small, full, steps=10, cameras=ring(), config=quick(), frozen=3, device="cpu"
+    )
+    assert report.gain > 0
+    assert same_bits(scene.select([0, 1, 2, 7]), small.select([0, 1, 2, 7]))
+    assert report.changed_count == 56
 
 
 @pytest.mark.slow

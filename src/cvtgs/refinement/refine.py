@@ -3,6 +3,8 @@
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock, check_listener
@@ -58,8 +60,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     background; Adam moves the Gaussians that they show. The scene of highest PSNR on held-out views
     is returned, or the input scene if none is better. Number of Gaussians, SH degree, comments,
     layout and extra columns are kept. Gaussians that no image shows stay bit for bit, as do those
-    that represent only themselves. About every third image of a scene tagged mip ignores the tag,
-    as many viewers do.
+    that represent only themselves, and invalid rows, which are not drawn. About every third image
+    of a scene tagged mip ignores the tag, as many viewers do.
 
     The same scenes, steps, configuration and seed give the same bits on a CPU; with ``seconds``
     the number of steps depends on the clock. The time includes everything, even the compilation
@@ -152,15 +154,18 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         images = ImageBuffer(theirs, views, config=config, seed=seed)
         scales = learning_rate_scales(ours, theirs)
         scales[:frozen] = 0.0
+        valid = valid_rows(ours)
+        drawn = ours if bool(valid.all()) else ours.select(valid)  # one NaN would spread in images
         found = optimize(
-            ours,
+            drawn,
             images,
             scorer,
             limits=limits,
             config=config,
-            learning_rate_scale=scales,
+            learning_rate_scale=scales[valid],
             listener=listener,
         )
+        refined = ours if found.scene is drawn else _with_rows(ours, valid, found.scene)
     report = RefineReport(
         steps=limits.steps,
         images=images.rendered,
@@ -168,13 +173,13 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         psnr_before=found.before,
         psnr_after=found.after,
         gain=found.after - found.before,
-        changed_count=changed_count(ours, found.scene),
+        changed_count=changed_count(ours, refined),
         stopped=found.stopped,
         backend=choose_backend("auto", place)[0],
         device=str(place),
         cost=clock.costs[0],
     )
-    return Refined(small if found.scene is ours else found.scene.to(small.device), report)
+    return Refined(small if refined is ours else refined.to(small.device), report)
 
 
 def join_reports(report: SimplifyReport, refined: Refined) -> SimplifyReport:
@@ -196,6 +201,15 @@ def changed_count(before: GaussianScene, after: GaussianScene) -> int:
         differs = (new != old) & ~(new.isnan() & old.isnan())
         changed |= differs.reshape(len(old), -1).any(dim=1)
     return int(changed.sum())
+
+
+def _with_rows(scene: GaussianScene, rows: Bool[Tensor, "n"], part: GaussianScene) -> GaussianScene:
+    """Return a scene with other values of some rows."""
+    tensors = {
+        name: old.masked_scatter(rows.view(-1, *[1] * (old.ndim - 1)), part.tensors()[name])
+        for name, old in scene.tensors().items()
+    }
+    return scene.with_tensors(tensors)
 
 
 def _on_device(
