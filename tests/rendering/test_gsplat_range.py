@@ -1,4 +1,4 @@
-"""The gsplat backend, with a stand-in for gsplat: large distances and large sets of images."""
+"""The gsplat backend, with a stand-in for gsplat: dtypes, distances and large sets of images."""
 
 import sys
 from dataclasses import replace
@@ -59,3 +59,18 @@ def test_few_pixels_are_rendered_at_once(installed, monkeypatch, pixels, groups)
     gsplat_backend.rasterize(scene, cameras, sh_degree=0)
     list(gsplat_backend.contributions(scene, cameras))
     assert installed == 2 * groups
+
+
+@pytest.fixture(params=[torch.bfloat16, torch.float64])
+def default_dtype(request):
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(request.param)
+    gsplat_backend._failure.cache_clear()
+    yield
+    gsplat_backend._failure.cache_clear()
+    torch.set_default_dtype(before)
+
+
+@pytest.mark.usefixtures("default_dtype")
+def test_the_probe_does_not_depend_on_the_default_dtype():
+    assert gsplat_backend._failure("cpu") == ""

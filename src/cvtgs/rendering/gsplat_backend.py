@@ -6,7 +6,7 @@ of 0.99.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from itertools import chain
 
@@ -240,25 +240,26 @@ def _probe(rasterize_one: Callable[..., RasterOutput], device: str) -> tuple[Ten
     Nothing in the scene is symmetric, so shifted pixels, swapped axes and a different order of SH
     coefficients or quaternion components all show up.
     """
+    number = partial(torch.tensor, dtype=torch.float32, device="cpu")
     scene = GaussianScene(
-        means=torch.tensor([[0.05, -0.02, 1.0]]),
-        quats=torch.tensor([[0.9, 0.1, -0.2, 0.4]]),
-        log_scales=torch.tensor([[0.08, 0.16, 0.12]]).log(),
-        logit_opacities=torch.tensor([0.4]),
-        sh0=torch.tensor([[[1.0, 0.5, 0.1]]]),
-        shN=torch.tensor([[[0.3, 0.0, 0.1], [0.2, 0.4, 0.0], [0.0, 0.3, 0.2]]]),
+        means=number([[0.05, -0.02, 1.0]]),
+        quats=number([[0.9, 0.1, -0.2, 0.4]]),
+        log_scales=number([[0.08, 0.16, 0.12]]).log(),
+        logit_opacities=number([0.4]),
+        sh0=number([[[1.0, 0.5, 0.1]]]),
+        shN=number([[[0.3, 0.0, 0.1], [0.2, 0.4, 0.0], [0.0, 0.3, 0.2]]]),
     ).to(device)
     means = scene.means.requires_grad_()
     cameras = Cameras(
-        viewmats=torch.eye(4)[None],
-        Ks=torch.tensor([[[8.0, 0, 3.7], [0, 9, 3.2], [0, 0, 1]]]),
+        viewmats=torch.eye(4, dtype=torch.float32, device="cpu")[None],
+        Ks=number([[[8.0, 0, 3.7], [0, 9, 3.2], [0, 0, 1]]]),
         width=8,
         height=7,
     ).to(device)
     output = rasterize_one(scene, cameras, sh_degree=1)
     image = torch.cat([output.rgb, output.depth[..., None], output.alpha[..., None]], dim=-1)
-    ramp = torch.linspace(0, 1, image.numel(), device=image.device).reshape(image.shape)
-    (gradient,) = torch.autograd.grad((image * ramp).sum(), means)
+    ramp = torch.linspace(0, 1, image.numel(), dtype=image.dtype, device=image.device)
+    (gradient,) = torch.autograd.grad((image.flatten() * ramp).sum(), means)
     return image.detach().cpu(), gradient.cpu()
 
 
