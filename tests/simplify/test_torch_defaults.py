@@ -12,7 +12,7 @@ from cvtgs.outofcore import simplify_file
 from cvtgs.rendering import contributions
 from cvtgs.streams import plan_stream, stream_file, write_sog_stream, write_tiles
 from cvtgs.synthetic import scene as make
-from cvtgs.views import automatic_views, mixed_views
+from cvtgs.views import automatic_views, find_view_positions, mixed_views
 from scenes import same_bits
 
 IMAGES = {
@@ -139,6 +139,16 @@ def test_views(scene, setting, find):
         found = find(scene, 3, **size)
     assert torch.equal(found.viewmats, wanted.viewmats)
     assert torch.equal(found.Ks, wanted.Ks)
+
+
+@settings
+def test_positions_above_a_floor(setting):
+    scene = make("courtyard", 500, sh_degree=0, seed=1)
+    wanted = find_view_positions(scene)
+    with setting():
+        found = find_view_positions(scene)
+    assert wanted.layout.floor is not None
+    assert torch.equal(found.eyes, wanted.eyes)
 
 
 @pytest.mark.parametrize("backend", ["torch", "numba"])

@@ -226,7 +226,8 @@ def lifted(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Float[Tensor, "c 
         return eyes
     least = layout.floor + _ABOVE * layout.frame.radius
     lacking = (least - eyes @ layout.up).clamp_min(0)
-    return eyes + (2 * lacking + 1e-9 * layout.frame.radius * (lacking > 0))[:, None] * layout.up
+    is_low = (lacking > 0).float()  # not of the default dtype
+    return eyes + (2 * lacking + 1e-9 * layout.frame.radius * is_low)[:, None] * layout.up
 
 
 def stand_free(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, "c"]:
