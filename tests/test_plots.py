@@ -69,6 +69,14 @@ def test_more_series_than_colours_and_fewer_panels_than_cells():
 
 
 @needs_matplotlib
+def test_a_legend_of_long_names_is_whole():
+    many = [Series(name=f"another tool, adaptive {k}", x=[0, 1], y=[k, 1]) for k in range(8)]
+    image = pixels(line_chart([Panel(series=many)], width=1000, height=600))
+    assert (image[500:, :5] == 255).all()
+    assert (image[500:, -5:] == 255).all()
+
+
+@needs_matplotlib
 def test_a_grid_cell_without_a_panel_stays_empty():
     image = pixels(line_chart([Panel(series=[LOSS])] * 3, columns=2, width=400, height=400))
     assert (image[:200, 200:] != 255).any()

@@ -92,7 +92,7 @@ def line_chart(
             list(lines.values()),
             list(lines),
             loc="outside lower center",
-            ncols=min(len(lines), 6),
+            ncols=max(1, min(len(lines), 6, width // (8 * max(map(len, lines)) + 70))),
             frameon=False,
         )
     if any(series.labels for panel in panels for series in panel.series):
