@@ -121,6 +121,20 @@ def test_what_is_near_a_block_reaches_half_of_its_diagonal_beyond_it():
     assert near.tolist() == [True, True, True, False, False, False]
 
 
+@pytest.mark.parametrize(
+    ("settings", "views"),
+    [
+        ({}, 8),  # all 480 images are among those of the matching: only held-out ones are asked for
+        ({"refine": {"steps_per_image": 10}}, 56),
+        ({"refine": {"size": 200}}, 136),  # other images than those of the matching
+        ({"refine": {"size": 200, "steps": 3}}, 20),
+    ],
+)
+def test_only_views_that_a_refinement_uses_are_searched(settings, views):
+    config = SimplifyConfig.model_validate({"preset": "high", **settings})
+    assert module.later_views(config) == views
+
+
 def test_reports_of_matched_blocks_are_joined():
     shared = {"backend": "numba"}
     one = MatchReport(views=3, opacities_kept=True, psnr_before=20.0, psnr_after=23.0, **shared)

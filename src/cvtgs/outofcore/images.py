@@ -25,6 +25,7 @@ from cvtgs.analysis.analyze import measured_areas, visibility_cameras
 from cvtgs.analysis.effects import drop_mip_tag, select_columns
 from cvtgs.boxes import inside
 from cvtgs.cameras import Cameras
+from cvtgs.config import SimplifyConfig
 from cvtgs.devices import one_thread
 from cvtgs.io import load
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
@@ -190,10 +191,17 @@ def _choose_views(job: Job, drawn: Drawn) -> tuple[Cameras | None, Cameras | Non
         views = make(config.visibility.views, size=config.visibility.size, seed=seed)
         views = visibility_cameras(members, config, cameras=views)
     if refines:
-        used = config.refine.steps * config.refine.images_per_step
-        number = min(config.refine.images, used) + config.refine.heldout
-        later = make(max(2, number), size=config.refine.size, seed=seed + LATER_SEED)
+        later = make(later_views(config), size=config.refine.size, seed=seed + LATER_SEED)
     return views, later
+
+
+def later_views(config: SimplifyConfig) -> int:
+    """Return the number of views that a refinement needs besides the images of the matching."""
+    refine, shared = config.refine, config.visibility.views
+    new = refine.steps * refine.images_per_step
+    if config.shares_images:
+        new = refine.new_images(refine.steps, given=shared - refine.heldout_of(shared))
+    return max(LEAST_CAMERAS, min(refine.images, new) + refine.heldout)
 
 
 def cameras_of_block(cameras: Cameras, members: GaussianScene) -> Cameras:
