@@ -83,7 +83,7 @@ def test_a_refinement_with_images_of_its_own_renders_held_out_ones_too(name):
     ]
     refine = shared.refine
     views = shared.visibility.views
-    assert counts[0] == refine.new_images(refine.steps, given=views - refine.heldout_of(views))
+    assert counts[0] == refine.new_images(refine.steps, shared=views)
     assert counts[1] == refine.new_images(refine.steps) + refine.heldout
 
 

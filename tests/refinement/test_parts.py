@@ -261,7 +261,7 @@ def test_observed_images_come_first_and_every_eighth_is_held_out():
     assert (len(views.heldout), len(views.heldout_images), len(views.images)) == (0, 2, 14)
     images = ImageBuffer(full, views, config=config, seed=0)
     drawn = [images.draw() for _ in range(50)]
-    assert [config.new_images(steps, given=14) for steps in (14, 49, 50, 100)] == [0, 0, 1, 2]
+    assert [config.new_images(steps, shared=16) for steps in (14, 49, 50, 100)] == [0, 0, 1, 2]
     assert images.rendered == 1
     given = {tuple(camera.viewmats.flatten().tolist()) for camera in observed.cameras.singles()}
     known = [tuple(image.cameras.viewmats.flatten().tolist()) in given for image in drawn]

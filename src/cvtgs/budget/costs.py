@@ -112,8 +112,7 @@ class Work:
         visibility, refine = config.visibility, config.refine
         shared = visibility.views if config.shares_images else 0
         heldout = refine.heldout_of(shared) if shared else refine.heldout
-        learned = shared - heldout if shared else 0
-        new_images = refine.new_images(refine.steps, given=learned)
+        new_images = refine.new_images(refine.steps, shared=shared)
         batches = math.ceil(new_images / refine.batch) + (not shared)
         checks = 1 + math.ceil(refine.steps / refine.check_every)
         renders = refine.steps * refine.images_per_step + SHARE_OF_A_STEP * heldout * checks

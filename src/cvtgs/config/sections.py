@@ -309,18 +309,19 @@ class RefineConfig(ImageSection):
     check_every: Count = 25
     patience: Count = 8
 
-    def new_images(self, steps: int, *, given: int = 0) -> int:
+    def new_images(self, steps: int, *, shared: int = 0) -> int:
         """Return the number of images of the full scene that some steps render, if available.
 
         Args:
             steps: Number of steps.
-            given: Training images that already exist.
+            shared: Images that already exist, of which some are held out.
 
         Returns:
             Number of images to render.
         """
         used = steps * self.images_per_step
-        first = max(0, self.first_images - given)
+        learned = shared - self.heldout_of(shared) if shared else 0
+        first = max(0, self.first_images - learned)
         later = max(0, used - first)
         return min(used, first) + later // self.steps_per_image
 

@@ -197,10 +197,10 @@ def _choose_views(job: Job, drawn: Drawn) -> tuple[Cameras | None, Cameras | Non
 
 def later_views(config: SimplifyConfig) -> int:
     """Return the number of views that a refinement needs besides the images of the matching."""
-    refine, shared = config.refine, config.visibility.views
+    refine = config.refine
     new = refine.steps * refine.images_per_step
     if config.shares_images:
-        new = refine.new_images(refine.steps, given=shared - refine.heldout_of(shared))
+        new = refine.new_images(refine.steps, shared=config.visibility.views)
     return max(LEAST_CAMERAS, min(refine.images, new) + refine.heldout)
 
 
