@@ -161,6 +161,32 @@ def test_the_bytes_of_version_4_are_as_expected(tmp_path: Path) -> None:
     assert (tmp_path / "0.spz").read_bytes()[15] == 5
 
 
+def test_axes_have_the_numbers_of_the_niantic_library(tmp_path: Path) -> None:
+    """The order of its enumeration CoordinateSystem, in splat-types.h."""
+    names = [
+        "ldb",
+        "rdb",
+        "lub",
+        "rub",
+        "ldf",
+        "rdf",
+        "luf",
+        "ruf",
+        "lfd",
+        "rfd",
+        "lfu",
+        "rfu",
+        "lbd",
+        "rbd",
+        "lbu",
+        "rbu",
+    ]
+    for number, axes in enumerate(names, start=1):
+        path = tmp_path / f"{axes}.spz"
+        save(storable_scene(1, degree=0), path, axes=axes, spz_version=4)
+        assert struct.unpack_from("<3I", path.read_bytes(), 32) == (0xADBE0003, 4, number)
+
+
 @pytest.mark.parametrize("version", [1, 5, "4"])
 def test_unknown_versions_are_not_written(tmp_path: Path, version: Version) -> None:
     with pytest.raises(InvalidArgumentError, match="must be 2, 3 or 4, found"):
@@ -169,7 +195,8 @@ def test_unknown_versions_are_not_written(tmp_path: Path, version: Version) -> N
 
 
 @pytest.mark.parametrize(
-    ("number", "axes"), [(0, "rub"), (1, "ldb"), (4, "rub"), (6, "rdf"), (16, "rfu")]
+    ("number", "axes"),
+    [(0, "rub"), (1, "ldb"), (4, "rub"), (6, "rdf"), (9, "lfd"), (12, "rfu"), (16, "rbu")],
 )
 def test_the_axes_that_a_file_states_are_used(tmp_path: Path, number: int, axes: str) -> None:
     """The extension of Adobe follows an unknown one; the argument takes precedence."""

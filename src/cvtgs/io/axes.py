@@ -14,7 +14,7 @@ from cvtgs.scene import GaussianScene, check_scene
 
 AXES = (
     *("ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf"),
-    *("lbd", "rbd", "lbu", "rbu", "lfd", "rfd", "lfu", "rfu"),
+    *("lfd", "rfd", "lfu", "rfu", "lbd", "rbd", "lbu", "rbu"),
 )
 """Where x, y and z point (left, right, up, down, back, forward); SPZ numbers these from 1."""
 
