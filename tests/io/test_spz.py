@@ -208,6 +208,23 @@ def test_the_axes_that_a_file_states_are_used(tmp_path: Path, number: int, axes:
     assert same_bits(load(path, axes="rdf"), plain)
 
 
+@pytest.mark.parametrize("version", [2, 3])
+def test_extensions_of_older_versions_follow_the_gaussians(tmp_path: Path, version: int) -> None:
+    """As Niantic's library wrote them: records of type, length and content."""
+    path = tmp_path / "a.spz"
+    plain = load(DATA / f"niantic-v{version}.spz")
+    content = gzip.decompress((DATA / f"niantic-v{version}.spz").read_bytes())
+    content = content[:14] + bytes([content[14] | 2]) + content[15:]
+    path.write_bytes(gzip.compress(content))  # the flag alone
+    assert same_bits(load(path), plain)
+    orbit = struct.pack("<II3f", 0xADBE0002, 12, -0.5, 0.5, 1.0)
+    path.write_bytes(gzip.compress(content + orbit))
+    assert same_bits(load(path), plain)
+    path.write_bytes(gzip.compress(content + orbit + struct.pack("<III", 0xADBE0003, 4, 4)))
+    assert same_bits(load(path), change_axes(plain, "rub", "rdf"))
+    assert same_bits(load(path, axes="rdf"), plain)
+
+
 @settings(max_examples=20, deadline=None)
 @given(count=st.integers(1, 40), seed=st.integers(0, 1000), degree=st.integers(0, 3))
 @example(count=14, seed=347, degree=0)  # its two largest components are equal

@@ -133,11 +133,25 @@ def test_surplus_data_is_not_unpacked(tmp_path: Path) -> None:
     assert caught[0].filename == __file__
 
 
-def test_extensions_before_version_4_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "body",
+    [
+        pytest.param(struct.pack("<Iff", 0xADBE0002, -0.5, 0.5) + GOOD[16:], id="before"),
+        pytest.param(GOOD[16:] + struct.pack("<II", 0xADBE0002, 12) + bytes(8), id="cut record"),
+        pytest.param(GOOD[16:] + bytes(3), id="no record"),
+        pytest.param(GOOD[16:] + bytes((1 << 20) + 8), id="too much"),
+    ],
+)
+def test_extensions_of_version_3_that_are_no_records_are_refused(
+    tmp_path: Path, body: bytes
+) -> None:
+    """A draft of the format had them before the Gaussians."""
     path = tmp_path / "a.spz"
-    path.write_bytes(gzip.compress(header(flags=2) + bytes(20) + GOOD[16:]))
-    with pytest.raises(FileFormatError, match="version 3 must have no extensions, found some"):
-        load(path)
+    path.write_bytes(gzip.compress(header(flags=2) + body))
+    assert refusal(path) == (
+        f"{path}: the extensions after the Gaussians must be whole records of at most 1,048,576 "
+        f"bytes together, found others; write it as version 4."
+    )
 
 
 def test_bands_above_the_third_are_left_out(tmp_path: Path) -> None:

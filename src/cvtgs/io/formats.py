@@ -107,8 +107,8 @@ def load(
         extras: Whether columns beyond the standard ones are kept; only plain PLY files have any.
         axes: The axes of the file, for example ``"rub"``, as :func:`cvtgs.io.change_axes` names
             them; the scene is converted to ``"rdf"``, the axes of PLY files. None uses those that
-            the file states (``.spz`` files of version 4 can) or its format prescribes (``"luf"``
-            for glTF), and ``"rdf"`` for other files.
+            the file states (``.spz`` files can) or its format prescribes (``"luf"`` for glTF), and
+            ``"rdf"`` for other files.
         trust_sizes: Whether a compressed file may unpack to any size. By default, one that claims
             far more Gaussians than its bytes can hold is refused before it takes memory.
         lod: Level of a streamed SOG; None for 0, the finest. Other files have no levels.

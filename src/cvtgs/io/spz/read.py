@@ -40,6 +40,8 @@ _MOST_BITS = 24
 
 _TABLE_START = slice(16, 20)
 
+_MOST_EXTENSION_BYTES = 1 << 20  # of versions 1 to 3; real ones have a few dozen bytes
+
 
 @dataclass(frozen=True, slots=True)
 class SpzHeader:
@@ -76,8 +78,8 @@ class SpzHeader:
 def read_spz(path: Path, *, axes: str | None = None, trust_sizes: bool = False) -> GaussianScene:
     """Read an ``.spz`` file of version 1 to 4.
 
-    Few files state their axes, by an extension of version 4. Other files are assumed to have the
-    axes of PLY files, as most tools write them; Niantic's apps write ``"rub"``.
+    Few files state their axes, by an extension. Other files are assumed to have the axes of PLY
+    files, as most tools write them; Niantic's apps write ``"rub"``.
 
     Args:
         path: The file.
@@ -104,8 +106,7 @@ def decode_spz(
 ) -> GaussianScene:
     """Decode the bytes of an ``.spz`` file as :func:`read_spz` does."""
     if content.startswith(_GZIP):
-        header, blocks = _read_gzip(content, path, trust_sizes=trust_sizes)
-        stated = None
+        header, blocks, stated = _read_gzip(content, path, trust_sizes=trust_sizes)
     elif content.startswith(_START):
         header, blocks, stated = _read_version_4(content, path, trust_sizes=trust_sizes)
     else:
@@ -160,7 +161,10 @@ def _quats(stored: UInt8[np.ndarray, "n b"]) -> Float[np.ndarray, "n 4"]:
     return np.roll(restore_largest((words >> 30).astype(np.int64), others), 1, axis=1)
 
 
-def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> tuple[SpzHeader, Blocks]:
+def _read_gzip(
+    content: bytes, path: Path | str, *, trust_sizes: bool
+) -> tuple[SpzHeader, Blocks, str | None]:
+    """Return the header, the blocks, and the axes if an extension after the blocks states them."""
     stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     try:
         header = _header(stream.decompress(content, HEADER.size), path, versions=(1, 2, 3))
@@ -170,7 +174,9 @@ def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> tuple[
                 path, count=header.count, sh_degree=header.sh_degree, stored=len(content)
             )
         payload = stream.decompress(stream.unconsumed_tail, wanted)
-        surplus = len(stream.decompress(stream.unconsumed_tail, 1))
+        is_extended = bool(header.flags & EXTENSIONS_FLAG)
+        most = _MOST_EXTENSION_BYTES if is_extended else 1
+        surplus = stream.decompress(stream.unconsumed_tail, most)
     except zlib.error as error:
         raise FileFormatError(
             f"{path}: must be intact gzip data, found damage: {error}."
@@ -180,12 +186,12 @@ def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> tuple[
             f"{path}: must hold {wanted:,} bytes for the {header.count:,} Gaussians of SH degree "
             f"{header.sh_degree} that the header promises, found {len(payload):,}."
         )
-    if surplus and header.flags & EXTENSIONS_FLAG:  # their end is not recorded
-        raise FileFormatError(
-            f"{path}: an .spz file of version {header.version} must have no extensions, found "
-            f"some; write it as version 4."
+    if is_extended and (stream.unconsumed_tail or _end_of_records(surplus) != len(surplus)):
+        raise FileFormatError(  # a draft had them before the Gaussians, which are then others
+            f"{path}: the extensions after the Gaussians must be whole records of at most "
+            f"{_MOST_EXTENSION_BYTES:,} bytes together, found others; write it as version 4."
         )
-    if surplus:
+    if surplus and not is_extended:
         warn(
             f"{path}: left out the bytes after the {header.count:,} Gaussians that the header "
             f"promises.",
@@ -195,7 +201,8 @@ def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> tuple[
         raise FileFormatError(f"{path}: must be intact gzip data, found it cut short.")
     ends = np.cumsum(list(header.sizes.values()), dtype=np.int64)[:-1]
     blocks = np.split(np.frombuffer(payload, np.uint8), ends)
-    return header, dict(zip(header.sizes, blocks, strict=True))
+    extensions = surplus if is_extended else b""
+    return header, dict(zip(header.sizes, blocks, strict=True)), _stated_axes(extensions, path)
 
 
 def _read_version_4(
@@ -228,6 +235,14 @@ def _read_version_4(
         at += packed
     extensions = content[FOURTH_HEADER_BYTES:start] if header.flags & EXTENSIONS_FLAG else b""
     return header, blocks, _stated_axes(extensions, path)
+
+
+def _end_of_records(extensions: bytes) -> int:
+    """Return the byte after the last record of extensions; more than there are if it is cut."""
+    at = 0
+    while at + 8 <= len(extensions):
+        at += 8 + int.from_bytes(extensions[at + 4 : at + 8], "little")
+    return at
 
 
 def _stated_axes(extensions: bytes, path: Path | str) -> str | None:
