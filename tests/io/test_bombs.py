@@ -20,6 +20,7 @@ import cvtgs
 from cvtgs.cli.main import build_parser, main
 from cvtgs.errors import FileFormatError
 from cvtgs.io.files import FREE_BYTES, MOST_EXPANSION
+from cvtgs.io.gltf.document import SPLATS, SPZ, write_chunks
 from format_cases import DATA, refusal
 from scenes import random_scene
 
@@ -203,6 +204,50 @@ def test_the_images_of_an_unbundled_sog_count_as_stored_bytes(tmp_path: Path) ->
     with pytest.raises(FileFormatError, match="that take 168,000,000 bytes in a file of"):
         cvtgs.load(tmp_path / "meta.json")
     assert len(cvtgs.load(DATA / "splat-transform.sog")) > 0
+
+
+@pytest.mark.parametrize("attributes", [{}, {"POSITION": 0}])
+def test_spz_that_many_nodes_repeat_counts_as_often(
+    tmp_path: Path, attributes: dict[str, int]
+) -> None:
+    """Whether or not an accessor states another number of Gaussians."""
+    count, path, file = FULLEST // 8, tmp_path / "a.glb", io.BytesIO()
+    spz = gzip.compress(spz_header(count) + bytes(count * 20), 9)
+    inside = {SPLATS: {"extensions": {SPZ: {"bufferView": 0}}}}
+    document = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [*range(40)]}],
+        "nodes": [{"mesh": 0}] * 40,
+        "meshes": [{"primitives": [{"mode": 0, "attributes": attributes, "extensions": inside}]}],
+        "accessors": [{"componentType": 5126, "count": 1, "type": "VEC3"}],
+        "bufferViews": [{"buffer": 0, "byteLength": len(spz)}],
+    }
+    write_chunks(file, document, len(spz), [spz])
+    path.write_bytes(file.getvalue())
+    size = path.stat().st_size
+    assert refusal(path) == (
+        f"{path}: a scene must take at most 64 MiB plus {MOST_EXPANSION} times the bytes of its "
+        f"file, found {40 * count:,} Gaussians that take {40 * count * 56:,} bytes in a file of "
+        f"{size:,}; if you trust the file, pass trust_sizes=True (--trust-sizes)."
+    )
+
+
+def test_files_that_a_stream_repeats_count_once(tmp_path: Path) -> None:
+    """They are read up to the one with which the scene gets too large."""
+    count, path = FULLEST // 2, tmp_path / "lod-meta.json"
+    sog(tmp_path / "a.sog", count)
+    leaves = [{"lods": {"0": {"file": file, "offset": 0, "count": count}}} for file in range(9)]
+    names = {"filenames": ["a.sog"] * 9, "lodLevels": 1, "tree": {"children": leaves}}
+    path.write_text(json.dumps(names))
+    size = (tmp_path / "a.sog").stat().st_size
+    assert refusal(path) == (
+        f"{path}: a scene must take at most 64 MiB plus {MOST_EXPANSION} times the bytes of its "
+        f"file, found {3 * count:,} Gaussians that take {3 * count * 56:,} bytes in a file of "
+        f"{size:,}; if you trust the file, pass trust_sizes=True (--trust-sizes)."
+    )
+    names |= {"filenames": ["a.sog"] * 2, "tree": {"children": leaves[:2]}}
+    path.write_text(json.dumps(names))
+    assert len(cvtgs.load(path)) == 2 * count
 
 
 @pytest.mark.parametrize("command", ["render", "evaluate", "compare", "tradeoff", "info"])

@@ -44,6 +44,7 @@ from cvtgs.io.gltf.document import (
     open_gltf,
 )
 from cvtgs.io.spz import decode_spz
+from cvtgs.io.spz.read import peek_spz
 from cvtgs.math.parameters import matrices_to_quats, quats_to_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
@@ -177,18 +178,33 @@ def _local_matrix(node: _Node) -> Matrix:
 
 
 def _check_sizes(file: GltfFile, placed: list[_Placed]) -> None:
-    """Refuse nodes that repeat the same bytes too often; SPZ inside is checked separately."""
-    counts = [
-        file.entry(Accessor, "accessors", _index(file, one, POSITION)).count
-        for one in placed
-        if POSITION in one.primitive.attributes
-    ]
-    degree = max(_degree(file, one) for one in placed)
-    check_expansion(file.path, count=sum(counts), sh_degree=degree, stored=file.stored)
+    """Refuse nodes that repeat the same bytes too often."""
+    counts, degrees = zip(*(_size(file, one) for one in placed), strict=True)
+    check_expansion(file.path, count=sum(counts), sh_degree=max(degrees), stored=file.stored)
+
+
+def _size(file: GltfFile, one: _Placed) -> tuple[int, int]:
+    """Return the number of Gaussians of a primitive, and their SH degree."""
+    packed = _packed(file, one)
+    if packed is not None:
+        header = peek_spz(*packed)
+        return header.count, header.sh_degree
+    position = file.entry(Accessor, "accessors", _index(file, one, POSITION))
+    return position.count, _degree(file, one)
+
+
+def _packed(file: GltfFile, one: _Placed) -> tuple[bytes, str] | None:
+    """Return the SPZ inside a primitive, and its name for errors; None if it has attributes."""
+    if SPZ not in one.splatting.extensions:
+        return None
+    value, where = one.splatting.extensions[SPZ], f"{one.where}: {SPZ!r}"
+    index = validated(_Compression, value, where).bufferView
+    content, _ = file.view(index)
+    return bytes(content), f"{file.path}: bufferViews[{index}]"
 
 
 def _read_primitive(file: GltfFile, one: _Placed, *, trust_sizes: bool) -> GaussianScene:
-    primitive, splatting, where, _ = one
+    primitive, splatting = one.primitive, one.splatting
     if primitive.mode != _POINTS or splatting.kernel != KERNEL:
         raise file.error(
             f"Gaussians must be points (mode 0) with the kernel {KERNEL!r}, found mode "
@@ -200,13 +216,11 @@ def _read_primitive(file: GltfFile, one: _Placed, *, trust_sizes: bool) -> Gauss
             f"{COLOR_SPACE!r}.",
             DroppedDataWarning,
         )
-    if SPZ in splatting.extensions:
-        inside = validated(_Compression, splatting.extensions[SPZ], f"{where}: {SPZ!r}")
-        content, _ = file.view(inside.bufferView)
-        name = f"{file.path}: bufferViews[{inside.bufferView}]"
-        scene = decode_spz(bytes(content), name, axes=SCENE_AXES, trust_sizes=trust_sizes)
-    else:
+    packed = _packed(file, one)
+    if packed is None:
         scene = _read_attributes(file, one)
+    else:
+        scene = decode_spz(*packed, axes=SCENE_AXES, trust_sizes=trust_sizes)
     return _moved(file, _with_comments(scene, primitive.extras), one)
 
 

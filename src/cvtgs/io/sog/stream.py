@@ -10,7 +10,18 @@ from pydantic import Field
 
 from cvtgs.edit import merge
 from cvtgs.errors import FileFormatError, InvalidArgumentError
-from cvtgs.io.files import Document, Items, Size, Text, Whole, is_within, read_json, validated
+from cvtgs.io.files import (
+    Document,
+    Items,
+    Size,
+    Text,
+    Whole,
+    check_expansion,
+    is_within,
+    read_json,
+    scene_size,
+    validated,
+)
 from cvtgs.io.sog.container import META
 from cvtgs.io.sog.read import read_sog
 from cvtgs.scene import GaussianScene
@@ -77,9 +88,13 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
         sources.append((_inside(path, meta.environment), []))
     if not sources:
         raise FileFormatError(f"{path}: level {lod} must hold at least one Gaussian, found none.")
-    scenes = []
+    stored = sum(scene_size(source) for source in dict(sources))  # each once
+    scenes: list[GaussianScene] = []
     for source, parts in sources:
         scenes.append(_read_rows(source, parts, trust_sizes=trust_sizes))
+        if not trust_sizes:  # many small files, or the same one many times
+            count, degree = sum(map(len, scenes)), max(scene.sh_degree for scene in scenes)
+            check_expansion(path, count=count, sh_degree=degree, stored=stored)
     return scenes[0] if len(scenes) == 1 else merge(scenes)
 
 

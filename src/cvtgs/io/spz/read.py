@@ -105,15 +105,8 @@ def decode_spz(
     content: bytes, path: Path | str, *, axes: str | None, trust_sizes: bool
 ) -> GaussianScene:
     """Decode the bytes of an ``.spz`` file as :func:`read_spz` does."""
-    if content.startswith(_GZIP):
-        header, blocks, stated = _read_gzip(content, path, trust_sizes=trust_sizes)
-    elif content.startswith(_START):
-        header, blocks, stated = _read_version_4(content, path, trust_sizes=trust_sizes)
-    else:
-        raise FileFormatError(
-            f"{path}: an .spz file must start with the magic number of gzip or SPZ, "
-            f"found {content[:4]!r}."
-        )
+    read = _read_gzip if _is_gzip(content, path) else _read_version_4
+    header, blocks, stated = read(content, path, trust_sizes=trust_sizes)
     if header.sh_degree > 3:
         warn(
             f"{path}: left out the SH bands above degree 3 (the file has degree "
@@ -123,6 +116,28 @@ def decode_spz(
     antialiased = bool(header.flags & ANTIALIASED_FLAG)
     scene = scene_of(_unpack(header, blocks), antialiased=antialiased)
     return change_axes(scene, axes or stated or SCENE_AXES, SCENE_AXES)
+
+
+def peek_spz(content: bytes, path: Path | str) -> SpzHeader:
+    """Return the header of the bytes of an ``.spz`` file, without unpacking its Gaussians."""
+    if not _is_gzip(content, path):
+        return _header(content[: HEADER.size], path, versions=(4,))
+    stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
+    try:
+        start = stream.decompress(content, HEADER.size)
+    except zlib.error as error:
+        raise _damage(path, error) from error
+    return _header(start, path, versions=(1, 2, 3))
+
+
+def _is_gzip(content: bytes, path: Path | str) -> bool:
+    """Return whether bytes are those of version 1 to 3, not 4; others are refused."""
+    if content.startswith((_GZIP, _START)):
+        return content.startswith(_GZIP)
+    raise FileFormatError(
+        f"{path}: an .spz file must start with the magic number of gzip or SPZ, "
+        f"found {content[:4]!r}."
+    )
 
 
 def _unpack(header: SpzHeader, blocks: Blocks) -> Arrays:
@@ -178,9 +193,7 @@ def _read_gzip(
         most = _MOST_EXTENSION_BYTES if is_extended else 1
         surplus = stream.decompress(stream.unconsumed_tail, most)
     except zlib.error as error:
-        raise FileFormatError(
-            f"{path}: must be intact gzip data, found damage: {error}."
-        ) from error
+        raise _damage(path, error) from error
     if len(payload) < wanted:
         raise FileFormatError(
             f"{path}: must hold {wanted:,} bytes for the {header.count:,} Gaussians of SH degree "
@@ -235,6 +248,10 @@ def _read_version_4(
         at += packed
     extensions = content[FOURTH_HEADER_BYTES:start] if header.flags & EXTENSIONS_FLAG else b""
     return header, blocks, _stated_axes(extensions, path)
+
+
+def _damage(path: Path | str, error: zlib.error) -> FileFormatError:
+    return FileFormatError(f"{path}: must be intact gzip data, found damage: {error}.")
 
 
 def _end_of_records(extensions: bytes) -> int:
