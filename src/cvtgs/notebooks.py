@@ -11,6 +11,7 @@ from cvtgs.evaluation.images import as_bytes, encode
 from cvtgs.rendering import render
 from cvtgs.report import Simplified
 from cvtgs.scene import GaussianScene
+from cvtgs.tags import described_tags
 from cvtgs.text import size_text
 from cvtgs.views import automatic_views
 
@@ -52,8 +53,8 @@ def _scene_facts(scene: GaussianScene) -> dict[str, str]:
         "memory": f"{size_text(size)}, {str(scene.dtype).removeprefix('torch.')}",
         "device": str(scene.device),
     }
-    if scene.antialiased:
-        facts["tags"] = "anti-aliased (mip)"
+    if tags := described_tags(scene.comments):
+        facts["tags"] = tags
     if scene.extras:
         facts["extra columns"] = html.escape(", ".join(scene.extras))
     return facts

@@ -1,7 +1,7 @@
 """Tags: comments of a file that say how its Gaussians are to be drawn."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 
@@ -32,3 +32,9 @@ ANTIALIASED = Tag(
 
 TWO_SCALES = Tag("SplatRenderMode: 2dgs", re.compile(r"(?i)SplatRenderMode: 2dgs"))
 """Surfels of 2DGS (Huang et al. 2024), as splat-transform marks them: a third scale is ignored."""
+
+
+def described_tags(comments: Sequence[str]) -> str:
+    """Return the tags among comments in words; empty if there is none."""
+    names = {"anti-aliased (mip)": ANTIALIASED, "flat (2dgs)": TWO_SCALES}
+    return ", ".join(name for name, tag in names.items() if tag.is_in(comments))

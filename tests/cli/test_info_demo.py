@@ -1,5 +1,7 @@
 """``cvtgs info`` and ``cvtgs demo``."""
 
+from dataclasses import replace
+
 import pytest
 
 import cvtgs
@@ -23,6 +25,21 @@ def test_info_prints_counts_and_statistics(tmp_path, capsys):
     printed = capsys.readouterr().out
     for text in ("Gaussians        2,000", "SH degree        2", "robust radius", "opacity < 0.1"):
         assert text in printed
+
+
+@pytest.mark.parametrize(
+    ("comments", "words"),
+    [
+        (("by hand",), "none"),
+        (("SplatRenderMode: mip",), "anti-aliased (mip)"),
+        (("SplatRenderMode: 2dgs", "by hand"), "flat (2dgs)"),
+    ],
+)
+def test_info_names_the_tags(tmp_path, capsys, comments, words):
+    scene = cvtgs.synthetic.scene("object", 50, sh_degree=0, seed=0)
+    cvtgs.save(replace(scene, comments=comments), tmp_path / "in.ply")
+    assert main(["info", str(tmp_path / "in.ply")]) == 0
+    assert f"tags             {words}" in capsys.readouterr().out.splitlines()
 
 
 def test_info_names_the_file_of_a_folder(tmp_path, capsys):

@@ -29,6 +29,7 @@ from cvtgs.cli.options import (
     read_settings,
 )
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
+from cvtgs.tags import described_tags
 from cvtgs.text import counted, printable, size_text
 
 if TYPE_CHECKING:
@@ -250,7 +251,7 @@ def _rows(facts: "SceneInfo") -> list[tuple[str, str]]:
             f"{facts.faint_share:.1%} of the Gaussians, {facts.faint_mass_share:.1%} of the mass",
         ),
         ("invalid rows", f"{facts.invalid_count:,}" + (f" ({invalid})" if invalid else "")),
-        ("tags", "anti-aliased (mip)" if facts.antialiased else "none"),
+        ("tags", described_tags(facts.comments) or "none"),
         ("comments", "; ".join(facts.comments) or "none"),
         ("extra columns", ", ".join(facts.extra_columns) or "none"),
     ]
