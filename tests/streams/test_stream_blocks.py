@@ -192,9 +192,21 @@ def test_an_unknown_kind_is_refused_before_the_work(tmp_path: Path, source: Path
     assert names_in(tmp_path) == ["scene.ply"]
 
 
-def test_other_axes_of_3d_tiles_are_refused(tmp_path: Path, source: Path) -> None:
-    with pytest.raises(InvalidArgumentError, match=r"own \(z up\), .* must be rdf, found 'rub'"):
-        stream(source, tmp_path / "out", kind="3dtiles", axes=("rub", "rub"))
+@pytest.mark.parametrize(
+    ("kind", "option", "text"),
+    [
+        ("3dtiles", {"axes": ("rub", "rub")}, r"own \(z up\), .* must be rdf, found 'rub'"),
+        ("3dtiles", {"environment_radii": 10.0}, "no environment, so environment_radii must be No"),
+        ("3dtiles", {"transform": (1.0, 2.0)}, "must be 16 finite numbers, .* found .1.0, 2.0."),
+        ("sog", {"transform": (1.0,) * 16}, "only 3D Tiles have a transform, found one for a SOG"),
+        ("sog", {"chunk_gaussians": 0}, "chunks of at least one Gaussian, .* and chunks of 0"),
+    ],
+)
+def test_options_that_a_kind_does_not_have_are_refused(
+    tmp_path: Path, source: Path, kind: str, option: dict[str, Any], text: str
+) -> None:
+    with pytest.raises(InvalidArgumentError, match=text):
+        stream(source, tmp_path / "out", kind=kind, **option)
     assert names_in(tmp_path) == ["scene.ply"]
 
 

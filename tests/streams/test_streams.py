@@ -273,6 +273,16 @@ def open_levels() -> tuple[Level, ...]:
     return Simplifier(preset="draft", device="cpu").levels(scene, [1.0, 0.25, 0.05])
 
 
+def test_tiles_have_no_environment(open_levels: tuple[Level, ...], tmp_path: Path) -> None:
+    """Its Gaussians are in no chunk, and were left out without a word."""
+    plan = plan_stream(open_levels, environment_radii=10)
+    with pytest.raises(
+        InvalidArgumentError, match="3D Tiles have no environment, so environment_radii"
+    ):
+        write_tiles(plan, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_far_gaussians_become_the_environment_of_all_levels(
     open_levels: tuple[Level, ...], tmp_path: Path
 ) -> None:

@@ -47,7 +47,8 @@ from cvtgs.streams.files import (
 )
 from cvtgs.streams.plan import CHUNK_GAUSSIANS, check_environment, near_rows, plan_part
 from cvtgs.streams.sog import SogFormat
-from cvtgs.streams.tiles import TilesFormat
+from cvtgs.streams.tiles import TilesFormat, check_no_environment, check_transform
+from cvtgs.text import counted
 from cvtgs.validity import with_finite_opacities
 
 __all__ = ["StreamReport", "stream_file"]
@@ -181,8 +182,8 @@ def stream_file(  # noqa: PLR0913 (options by name)
 
     Raises:
         ConfigError: The configuration renders images, which needs the whole scene in memory.
-        InvalidArgumentError: A ratio is out of range, two ratios give the same size, or other axes
-            are asked of 3D Tiles.
+        InvalidArgumentError: A ratio is out of range, two ratios give the same size, chunks would
+            be empty, or the kind does not have an option.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
         OutputExistsError: The folder holds files that may not be replaced.
@@ -198,20 +199,17 @@ def stream_file(  # noqa: PLR0913 (options by name)
         ...     [len(load(out, lod=lod)) for lod in (0, 1)], report.blocks
         ([2000, 200], 3)
     """
-    if kind == "3dtiles" and axes[1] != SCENE_AXES:
-        raise InvalidArgumentError(
-            f"3D Tiles have axes of their own (z up), so the axes of the output must be "
-            f"{SCENE_AXES}, found {axes[1]!r}."
-        )
     check_environment(environment_radii)
+    form = _format(kind, axes=axes, environment_radii=environment_radii, transform=transform)
     simplifier, workers = simplifier or Simplifier(device="cpu"), workers or map
     check_config(simplifier.config, with_images=False)
     rows = open_rows(source)
     targets = sorted({target_count(rows.count, rho) for rho in rhos}, reverse=True)
-    if len(targets) < len(rhos) or not targets:
+    if len(targets) < len(rhos) or not targets or chunk_gaussians < 1:
         raise InvalidArgumentError(
-            f"a stream needs levels of different sizes, found ratios {list(rhos)} of "
-            f"{rows.count:,} Gaussians."
+            f"a stream needs levels of different sizes and chunks of at least one Gaussian, found "
+            f"ratios {list(rhos)} of {counted(rows.count, 'Gaussian')} and chunks of "
+            f"{chunk_gaussians}."
         )
     merged = [target for target in targets if target < rows.count] or targets
     room = memory or memory_to_plan()
@@ -228,7 +226,6 @@ def stream_file(  # noqa: PLR0913 (options by name)
         range_rows=rows_per_range(rows.count),
         sample_rows=sample_rows(room),
     )
-    form = SogFormat() if kind == "sog" else TilesFormat(transform=transform)
     choices = repr((form, chunk_gaussians, axes, sh_degree, environment_radii))
     facts = [job.key(simplifier.checkpoint), targets, choices]
     key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
@@ -250,6 +247,27 @@ def stream_file(  # noqa: PLR0913 (options by name)
         shutil.rmtree(Path(spec.job.folder).parent, ignore_errors=True)
     chunks = sum(part.chunks for part in parts)
     return StreamReport(join_levels(parts), chunks, len(parts), resumed)
+
+
+def _format(
+    kind: str,
+    *,
+    axes: tuple[str, str],
+    environment_radii: float | None,
+    transform: tuple[float, ...] | None,
+) -> StreamFormat:
+    """Return the format of a stream; refuse options that it does not have."""
+    if kind != "3dtiles":
+        if transform is not None:
+            raise InvalidArgumentError("only 3D Tiles have a transform, found one for a SOG.")
+        return SogFormat()
+    if axes[1] != SCENE_AXES:
+        raise InvalidArgumentError(
+            f"3D Tiles have axes of their own (z up), so the axes of the output must be "
+            f"{SCENE_AXES}, found {axes[1]!r}."
+        )
+    check_no_environment(environment_radii is not None)
+    return TilesFormat(transform=None if transform is None else check_transform(transform))
 
 
 def _run(

@@ -136,7 +136,8 @@ def write_tiles(
         the tree; each of its tiles is counted once.
 
     Raises:
-        InvalidArgumentError: The transform is not affine and invertible.
+        InvalidArgumentError: The transform is not affine and invertible, or the plan has an
+            environment, which 3D Tiles cannot hold.
         OutputExistsError: The folder holds files that may not be replaced.
         OutputError: A file cannot be written.
         InvalidSceneError: No Gaussian of a tile is finite.
@@ -152,6 +153,7 @@ def write_tiles(
         ...     len(cvtgs.load(f"{folder}/0_0.glb")), written[0].gaussians
         (25, 250)
     """
+    check_no_environment(bool(plan.far))
     form = TilesFormat(
         tile_gaussians=tile_gaussians,
         transform=None if transform is None else check_transform(transform),
@@ -197,6 +199,14 @@ def geo_transform(longitude: float, latitude: float, height: float = 0.0) -> tup
         (across + height) * cos_north * cos_east, (across + height) * cos_north * sin_east,
         (across * (1.0 - squared) + height) * sin_north, 1.0,
     )  # fmt: skip
+
+
+def check_no_environment(has_one: bool) -> None:
+    """Refuse an environment, whose Gaussians are in no chunk, so that tiles would lack them."""
+    if has_one:
+        raise InvalidArgumentError(
+            "3D Tiles have no environment, so environment_radii must be None, found a distance."
+        )
 
 
 def check_transform(numbers: Sequence[float]) -> tuple[float, ...]:
