@@ -39,6 +39,14 @@ def test_a_small_stream_is_one_chunk(words: list[str], capsys: pytest.CaptureFix
     assert capsys.readouterr().out.startswith("a.ply in one chunk, the finest level first:")
 
 
+@pytest.mark.parametrize(("radii", "has_one"), [("0.5", True), ("1000", False)])
+def test_an_environment_is_mentioned_only_if_there_is_one(
+    words: list[str], radii: str, has_one: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*words, "--stream", "sog", "--rho", "0.1", "--environment", radii]) == 0
+    assert ("Not counted: the environment" in capsys.readouterr().out) == has_one
+
+
 @pytest.mark.parametrize(
     ("more", "said"),
     [

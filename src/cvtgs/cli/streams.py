@@ -222,6 +222,8 @@ def _print_levels(
     *,
     errors: Sequence[float] = (),
 ) -> None:
+    from cvtgs.streams.sog import ENVIRONMENT
+
     if options.quiet:
         return
     number = "one chunk" if chunks == 1 else f"{chunks:,} chunks"
@@ -231,7 +233,7 @@ def _print_levels(
         last = "" if error is None else f"{error:.3g}"
         rows.append(["", f"{one.gaussians:,}", size_text(one.bytes), f"{one.files:,}", last])
     say_table(rows)
-    if options.environment is not None:
+    if options.environment is not None and (options.output / ENVIRONMENT).exists():
         say_wrapped(
             f"Not counted: the environment beyond {options.environment:g} times the robust radius, "
             "which all levels share."

@@ -26,8 +26,7 @@ __all__ = ["write_sog_stream"]
 
 FILE_GAUSSIANS = 1 << 18  # maximum number of Gaussians in a file, unless a single chunk has more
 
-
-_FAR = "environment"
+ENVIRONMENT = "environment"  # name of its folder
 
 
 class _Unit(NamedTuple):
@@ -95,8 +94,8 @@ class SogFormat:
         scenes = [load(folder / name, trust_sizes=True) for name in _far_files(parts)]
         more = {}
         if scenes:
-            _write_sog(concatenate(scenes), folder / _FAR)
-            more = {"environment": f"{_FAR}/meta.json"}
+            _write_sog(concatenate(scenes), folder / ENVIRONMENT)
+            more = {"environment": f"{ENVIRONMENT}/meta.json"}
         return {
             "version": 1,
             "asset": {"generator": "cvtgs"},
