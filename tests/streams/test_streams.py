@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 
 from cvtgs import GaussianScene, Simplifier, concatenate, load
 from cvtgs.errors import InvalidArgumentError, OutputExistsError
+from cvtgs.io.atomic import replace_file
 from cvtgs.progress import ProgressEvent, silent
 from cvtgs.report import Level
 from cvtgs.streams import (
@@ -196,6 +198,32 @@ def test_existing_files_are_replaced_only_with_overwrite(plan: StreamPlan, tmp_p
     write_sog_stream(plan, tmp_path, overwrite=True)
     with pytest.raises(OutputExistsError, match=r"needs an empty folder, or one with ti"):
         write_tiles(plan, tmp_path, overwrite=True)
+
+
+def test_an_existing_folder_is_kept(plan: StreamPlan, tmp_path: Path) -> None:
+    """It has permissions, and may be the current one of a shell."""
+    out = tmp_path / "out"
+    out.mkdir(mode=0o700)
+    before = out.stat()
+    write_sog_stream(plan, out)
+    assert os.path.samestat(out.stat(), before)
+    assert out.stat().st_mode == before.st_mode
+    assert len(load(out)) == plan.counts[0]
+
+
+def test_an_interrupt_empties_an_existing_folder(
+    plan: StreamPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def move(source: Path, target: Path) -> None:
+        if source.suffix == ".json":  # the index, the last one
+            raise KeyboardInterrupt
+        replace_file(source, target)
+
+    monkeypatch.setattr("cvtgs.streams.files.replace_file", move)
+    (tmp_path / "out").mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        write_sog_stream(plan, tmp_path / "out")
+    assert [*tmp_path.rglob("*")] == [tmp_path / "out"]
 
 
 @pytest.mark.parametrize("kind", ["sog", "3dtiles"])

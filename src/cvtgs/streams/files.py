@@ -6,6 +6,7 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -195,14 +196,13 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
 def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
     """Move the files of a finished stream to the output folder, the index last.
 
+    A folder that exists is kept, since it has permissions and may be the current one of a shell.
     Hidden files are not published: only resumed runs need them.
     """
     check_stream(place, kind, overwrite=overwrite)
     index, target = INDEX_NAMES[kind], Path(os.path.realpath(place))
     try:
-        if not target.exists() or not any(target.iterdir()):  # then one rename publishes all files
-            if target.exists():
-                target.rmdir()
+        if not target.exists():  # then one rename publishes all files
             hidden.rename(target)
             for path in target.glob(".*"):
                 path.unlink()
@@ -212,6 +212,7 @@ def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
     found = [path.name for path in hidden.iterdir()]
     names = [name for name in found if name != index and not name.startswith(".")]
     old = _names_of(place / index) - {*names}
+    is_new = not (place / index).exists()
     try:
         for name in [*names, index]:
             if (place / name).is_dir():
@@ -219,8 +220,13 @@ def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
             replace_file(hidden / name, place / name)
         for name in old:  # left over from the replaced stream
             _remove(place / name)
-    except OSError as error:
-        raise _refused(place, error) from error
+    except BaseException as error:
+        for name in names if is_new else ():
+            with suppress(OSError):
+                _remove(place / name)
+        if isinstance(error, OSError):
+            raise _refused(place, error) from error
+        raise
 
 
 def _names_of(index: Path) -> set[str]:
