@@ -85,6 +85,22 @@ def test_every_compression_is_read(tmp_path: Path, level: int, degree: int) -> N
 
 
 @pytest.mark.parametrize(
+    ("stated", "bounds"),
+    [((0, 0), (-1.5, 1.5)), ((0, 0.5), (-1.5, 0.5)), ((-2, 0), (-2, 1.5)), ((-1, 2), (-1, 2))],
+)
+def test_a_bound_of_0_stands_for_the_usual_one(
+    tmp_path: Path, stated: tuple[float, float], bounds: tuple[float, float]
+) -> None:
+    """Each for itself, as in GaussianSplats3D and splat-transform."""
+    path = write(tmp_path / "a.ksplat", 2, section(2, 1, 700, 0))
+    content = path.read_bytes()
+    path.write_bytes(content[:36] + struct.pack("<ff", *stated) + content[44:])
+    levels = np.round((section(2, 1, 700, 0)[2]["sh"][:, :3] + 1.5) / 3 * 255) / 255
+    wanted = torch.from_numpy(bounds[0] + levels * (bounds[1] - bounds[0])).float()
+    torch.testing.assert_close(cvtgs.load(path).shN[:, :, 0], wanted)
+
+
+@pytest.mark.parametrize(
     ("place", "number", "text"),
     [
         (1, struct.pack("<B", 2), "must be a .ksplat of version 0.1 with compression 0, 1 or 2"),

@@ -77,6 +77,13 @@ def test_the_finest_level_is_read_with_its_environment(stream: Path) -> None:
     assert scene_size(stream) == sum(path.stat().st_size for path in files)
 
 
+@pytest.mark.parametrize("name", ["", None])
+def test_an_empty_name_is_no_environment(stream: Path, name: str | None) -> None:
+    """PlayCanvas' engine and splat-transform take it so."""
+    path = changed(stream, lambda document: document.update(environment=name))
+    assert len(load(path)) == 7
+
+
 def test_a_chunk_without_the_level_gives_its_next_level(stream: Path) -> None:
     def drop(document: dict[str, Any]) -> None:
         near, far = (child["lods"] for child in document["tree"]["children"])

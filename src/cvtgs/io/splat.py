@@ -48,7 +48,7 @@ _NUMBERS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 
 _RANGE = 32767  # quantised positions are centred on this number, unless the section states another
 
-_SH_RANGE = (-1.5, 1.5)
+_SH_RANGE = (-1.5, 1.5)  # 0 in the header stands for the usual bound
 
 _COMPONENTS = (0, 9, 24)  # view-dependent SH components of a Gaussian, by degree
 
@@ -148,7 +148,7 @@ def read_ksplat(path: Path) -> GaussianScene:
             _Section(*_SECTION.unpack_from(headers, number * SECTION_BYTES))
             for number in range(most)
         ]
-        sh_range = (low, high) if low or high else _SH_RANGE
+        sh_range = (low or _SH_RANGE[0], high or _SH_RANGE[1])
         degree = max((one.sh_degree for one in sections if one.used), default=0)
         parts = []
         for section in sections:

@@ -84,7 +84,7 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
     _check_count(meta, ranges, lod if complete else None, path)
     names = [(meta.filenames[number], parts) for number, parts in sorted(ranges.items())]
     sources = [(_inside(path, name), parts) for name, parts in names]
-    if meta.environment is not None:
+    if meta.environment:
         sources.append((_inside(path, meta.environment), []))
     if not sources:
         raise FileFormatError(f"{path}: level {lod} must hold at least one Gaussian, found none.")
