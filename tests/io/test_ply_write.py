@@ -14,6 +14,7 @@ from cvtgs.errors import DroppedDataWarning, FileFormatError, InvalidSceneError
 from cvtgs.io import load, save
 from cvtgs.io.ply import write
 from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
+from cvtgs.text import shown
 from ply_files import gaussian_properties, gaussian_rows, parse_header, write_ply_file
 
 
@@ -226,7 +227,13 @@ def test_parameters_with_gradients_can_be_saved(tmp_path: Path) -> None:
         ),
         (
             {"extras": {"a b": torch.ones(2)}},
-            "extra column 'a b' must have a name without blanks to be written to a PLY.",
+            "extra column 'a b' must have a name of at most 200 letters without blanks to be "
+            "written to a PLY.",
+        ),
+        (
+            {"extras": {"a" * 201: torch.ones(2)}},
+            f"extra column {shown('a' * 201)} must have a name of at most 200 letters without "
+            "blanks to be written to a PLY.",
         ),
         (
             {"extras": {"q": torch.tensor([-1, 2**31])}},

@@ -29,7 +29,7 @@ _OTHER_FILES = {
     b"<": "a web page; failed downloads often leave one",
 }
 _COUNT = re.compile("[0-9]{1,18}")
-_MAX_NAME_LETTERS = 200
+MAX_NAME_LETTERS = 200
 
 _REST_NAME = re.compile(r"f_rest_(0|[1-9][0-9]*)")
 
@@ -137,15 +137,15 @@ def read_header(file: BinaryIO, path: str) -> Header:
                 comments.append(line.lstrip()[len("comment ") :].rstrip())
             case ["format", kind, "1.0"] if encoding is None and kind in get_args(Encoding):
                 encoding = kind  # type: ignore[assignment]
-            case ["element", name, count] if _COUNT.fullmatch(count) and _is_name(name):
+            case ["element", name, count] if _COUNT.fullmatch(count) and is_name(name):
                 tables.append((name, int(count), []))
             case ["property", "list", length, kind, name] if (
-                tables and length in _LENGTH_NAMES and kind in TYPE_NAMES and _is_name(name)
+                tables and length in _LENGTH_NAMES and kind in TYPE_NAMES and is_name(name)
             ):
                 tables[-1][2].append(
                     Property(name=name, type=TYPE_NAMES[kind], count_type=TYPE_NAMES[length])
                 )
-            case ["property", kind, name] if tables and kind in TYPE_NAMES and _is_name(name):
+            case ["property", kind, name] if tables and kind in TYPE_NAMES and is_name(name):
                 tables[-1][2].append(Property(name=name, type=TYPE_NAMES[kind]))
             case _:
                 raise FileFormatError(
@@ -196,9 +196,9 @@ def _decode(line: bytes) -> str:
         return line.decode("latin-1")
 
 
-def _is_name(text: str) -> bool:
+def is_name(text: str) -> bool:
     """Return whether a name is short enough for error texts; real ones have about 20 letters."""
-    return len(text) <= _MAX_NAME_LETTERS
+    return len(text) <= MAX_NAME_LETTERS
 
 
 def _check_unique(named: Sequence[Element | Property], what: str) -> None:

@@ -14,16 +14,19 @@ from torch import Tensor
 from cvtgs.errors import DroppedDataWarning, FileFormatError, InvalidSceneError, warn
 from cvtgs.io.ply.header import (
     FLOAT_TYPES,
+    MAX_NAME_LETTERS,
     SCALARS,
     Layout,
     dtype_of,
     header_bytes,
+    is_name,
     is_standard,
     row_dtype,
     standard_slots,
 )
 from cvtgs.io.ply.read import open_rows
 from cvtgs.scene import FLAT_LOG_SCALE, NORMALS, GaussianScene
+from cvtgs.text import shown
 
 CHUNK_BYTES = 1 << 20  # bytes that are gathered before they are written
 
@@ -147,9 +150,10 @@ def _check_names(scene: GaussianScene) -> None:
             raise InvalidSceneError(
                 f"extra column {name!r} must not be named like a property of the scene itself."
             )
-        if name.split() != [name]:
+        if name.split() != [name] or not is_name(name):
             raise InvalidSceneError(
-                f"extra column {name!r} must have a name without blanks to be written to a PLY."
+                f"extra column {shown(name)} must have a name of at most {MAX_NAME_LETTERS} "
+                f"letters without blanks to be written to a PLY."
             )
     for name, kind in scene.layout:
         if kind not in SCALARS:
