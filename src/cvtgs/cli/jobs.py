@@ -83,8 +83,8 @@ def add_paths(parser: CommandParser, *, options: str) -> None:
         "--suffix",
         type=dotted,
         metavar="END",
-        help="format of the scenes in DIR or on standard output, for example .spz (default: the "
-        "format of IN if it can be written, else .ply)",
+        help="format, for example .spz, of the scenes in DIR (default: the format of IN if it can "
+        "be written, else .ply) or on standard output (default: .ply)",
     )
 
 
