@@ -119,9 +119,10 @@ def test_lod_is_refused_for_other_files_and_out_of_range(stream: Path, tmp_path:
     save(storable_scene(3), tmp_path / "a.ply")
     with pytest.raises(InvalidArgumentError, match=r"only for a streamed SOG \(lod-meta.json\), f"):
         load(tmp_path / "a.ply", lod=0)
-    for lod in (-1, 2):
+    wrongs: tuple[Any, ...] = (-1, 2, 0.5, "1", True)
+    for lod in wrongs:
         with pytest.raises(
-            InvalidArgumentError, match=f"from 0 to 1, the levels of .*, found {lod}"
+            InvalidArgumentError, match=f"from 0 to 1, the levels of .*, found {lod!r}"
         ):
             load(stream, lod=lod)
 

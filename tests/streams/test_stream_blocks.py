@@ -200,9 +200,15 @@ def test_an_unknown_kind_is_refused_before_the_work(tmp_path: Path, source: Path
         ("3dtiles", {"transform": (1.0, 2.0)}, "must be 16 finite numbers, .* found .1.0, 2.0."),
         ("sog", {"transform": (1.0,) * 16}, "only 3D Tiles have a transform, found one for a SOG"),
         ("sog", {"chunk_gaussians": 0}, "chunks of at least one Gaussian, .* and chunks of 0"),
+        ("sog", {"chunk_gaussians": "9"}, "chunks of at least one Gaussian, .* and chunks of '9'"),
+        ("sog", {"axes": "rdf"}, "axes must be those of the input file and those of the output, f"),
+        ("sog", {"axes": ("rdf", "xyz")}, "axes must be the directions .*; found 'xyz'"),
+        ("sog", {"sh_degree": 4}, "sh_degree must be from 0 to 3, found 4"),
+        ("sog", {"blocks": "3"}, "blocks must be a whole number above 0, found '3'"),
+        ("sog", {"memory": -1}, "memory must be a whole number above 0, found -1"),
     ],
 )
-def test_options_that_a_kind_does_not_have_are_refused(
+def test_impossible_options_are_refused_before_the_work(
     tmp_path: Path, source: Path, kind: str, option: dict[str, Any], text: str
 ) -> None:
     with pytest.raises(InvalidArgumentError, match=text):

@@ -274,10 +274,25 @@ def test_the_transform_of_tiles_is_written_and_checked(plan: StreamPlan, tmp_pat
     assert json.loads((tmp_path / "a" / "tileset.json").read_text())["root"]["transform"] == [
         *place
     ]
-    for wrong in ((1.0,) * 3, (0.0,) * 15 + (1.0,), (1.0,) * 16):
+    wrongs: list[Any] = [(1.0,) * 3, (0.0,) * 15 + (1.0,), (1.0,) * 16, "1,0", 3, torch.eye(4)]
+    for wrong in wrongs:
         with pytest.raises(InvalidArgumentError, match="must be 16 finite numbers"):
             write_tiles(plan, tmp_path / "b", transform=wrong)
     assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.parametrize("write", [write_sog_stream, write_tiles])
+def test_arguments_of_other_types_are_refused(plan: StreamPlan, tmp_path: Path, write: Any) -> None:
+    most = "file_gaussians" if write is write_sog_stream else "tile_gaussians"
+    for words, options, text in (
+        ((3, tmp_path), {}, "plan must be of type StreamPlan, found int"),
+        ((plan, 3), {}, "a path must be a str or Path, found int"),
+        ((plan, tmp_path), {most: "9"}, f"{most} must be a whole number above 0, found '9'"),
+    ):
+        with pytest.raises(InvalidArgumentError, match=text):
+            write(*words, **options)
+    with pytest.raises(InvalidArgumentError, match="found 'east', 1"):
+        geo_transform("east", 1.0)  # type: ignore[arg-type]
 
 
 def test_a_failed_stream_leaves_no_files(plan: StreamPlan, tmp_path: Path) -> None:

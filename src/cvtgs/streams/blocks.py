@@ -15,15 +15,16 @@ from torch import Tensor
 
 from cvtgs.analysis.effects import select_columns
 from cvtgs.clock import StageClock
-from cvtgs.counts import shared_out, target_count
+from cvtgs.counts import check_whole, shared_out, target_count, whole_number
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
-from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, check_path, warn
 from cvtgs.grouping import finer_count
 from cvtgs.io import change_axes
 from cvtgs.io.atomic import make_folder
-from cvtgs.io.axes import SCENE_AXES
+from cvtgs.io.axes import SCENE_AXES, checked_axes
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
+from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.outofcore import Workers
 from cvtgs.outofcore.job import Job, job_folder, started
 from cvtgs.outofcore.memory import block_count, memory_to_plan, sample_rows
@@ -48,7 +49,7 @@ from cvtgs.streams.files import (
 from cvtgs.streams.plan import CHUNK_GAUSSIANS, check_environment, near_rows, plan_part
 from cvtgs.streams.sog import SogFormat
 from cvtgs.streams.tiles import TilesFormat, check_no_environment, check_transform
-from cvtgs.text import counted
+from cvtgs.text import counted, shown
 from cvtgs.validity import with_finite_opacities
 
 __all__ = ["StreamReport", "stream_file"]
@@ -183,7 +184,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
     Raises:
         ConfigError: The configuration renders images, which needs the whole scene in memory.
         InvalidArgumentError: A ratio is out of range, two ratios give the same size, chunks would
-            be empty, or the kind does not have an option.
+            be empty, the kind does not have an option, or an argument has another type.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
         OutputExistsError: The folder holds files that may not be replaced.
@@ -199,17 +200,20 @@ def stream_file(  # noqa: PLR0913 (options by name)
         ...     [len(load(out, lod=lod)) for lod in (0, 1)], report.blocks
         ([2000, 200], 3)
     """
+    check_path(source)
+    check_path(folder)
     check_environment(environment_radii)
+    _check_arguments(axes, sh_degree, memory=memory, blocks=blocks)
     form = _format(kind, axes=axes, environment_radii=environment_radii, transform=transform)
     simplifier, workers = simplifier or Simplifier(device="cpu"), workers or map
     check_config(simplifier.config, with_images=False)
     rows = open_rows(source)
     targets = sorted({target_count(rows.count, rho) for rho in rhos}, reverse=True)
-    if len(targets) < len(rhos) or not targets or chunk_gaussians < 1:
+    if len(targets) < len(rhos) or not targets or whole_number(chunk_gaussians) < 1:
         raise InvalidArgumentError(
             f"a stream needs levels of different sizes and chunks of at least one Gaussian, found "
             f"ratios {list(rhos)} of {counted(rows.count, 'Gaussian')} and chunks of "
-            f"{chunk_gaussians}."
+            f"{shown(chunk_gaussians)}."
         )
     merged = [target for target in targets if target < rows.count] or targets
     room = memory or memory_to_plan()
@@ -247,6 +251,21 @@ def stream_file(  # noqa: PLR0913 (options by name)
         shutil.rmtree(Path(spec.job.folder).parent, ignore_errors=True)
     chunks = sum(part.chunks for part in parts)
     return StreamReport(join_levels(parts), chunks, len(parts), resumed)
+
+
+def _check_arguments(axes: tuple[str, str], sh_degree: int | None, **counts: int | None) -> None:
+    """Check arguments that are used only in the middle of the work."""
+    if isinstance(axes, str) or len(axes) != 2:
+        raise InvalidArgumentError(
+            f"axes must be those of the input file and those of the output, found {shown(axes)}."
+        )
+    for name in axes:
+        checked_axes(name)
+    if sh_degree is not None and whole_number(sh_degree) not in range(len(REST_COUNTS)):
+        raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {shown(sh_degree)}.")
+    for name, count in counts.items():
+        if count is not None:
+            check_whole(count, name)
 
 
 def _format(
@@ -325,7 +344,7 @@ def write_block(spec: StreamJob, block: int) -> None:
     scan = job.read_scan()
     analysis = analysis_of(scan, rows)
     if spec.sh_degree is not None:
-        scene = scene.with_sh_degree(min(spec.sh_degree, scene.sh_degree))
+        scene = scene.with_sh_degree(spec.sh_degree)
     levels: list[BlockLevel] = []
     clock = StageClock(silent, scene.device)
     for target in targets:

@@ -19,6 +19,7 @@ from cvtgs.errors import (
     InvalidArgumentError,
     OutputError,
     OutputExistsError,
+    check_path,
     reason_of,
     warn,
 )
@@ -113,8 +114,8 @@ def write_stream(
     listener: ProgressListener,
 ) -> tuple[StreamLevel, ...]:
     """Write a stream of one part; either all files are written or none."""
+    check_stream(folder, form.kind, overwrite=overwrite)
     place = Path(folder)
-    check_stream(place, form.kind, overwrite=overwrite)
     hidden = hidden_path(place, "stream")
     shutil.rmtree(hidden, ignore_errors=True)
     make_folder(hidden)
@@ -179,6 +180,7 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
     if kind not in INDEX_NAMES:
         names = " or ".join(INDEX_NAMES)
         raise InvalidArgumentError(f"kind of a stream must be {names}, found {kind!r}.")
+    check_path(folder)
     place = Path(folder)
     if not os.path.exists(place):  # noqa: PTH110 (false for impossible names)
         check_output(place)  # checks that its parent exists and is writable

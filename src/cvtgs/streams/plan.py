@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.boxes import Corner
+from cvtgs.counts import whole_number
 from cvtgs.cvt import nearest_site
 from cvtgs.devices import on_host
 from cvtgs.errors import InvalidArgumentError
@@ -159,10 +160,10 @@ def plan_stream(
     check_environment(environment_radii)
     ordered = tuple(sorted(levels, key=lambda level: -len(level.scene)))
     counts = [len(level.scene) for level in ordered]
-    if not counts or len(set(counts)) < len(counts) or chunk_gaussians < 1:
+    if not counts or len(set(counts)) < len(counts) or whole_number(chunk_gaussians) < 1:
         raise InvalidArgumentError(
             f"a stream needs levels of different sizes and chunks of at least one Gaussian, found "
-            f"levels of {counts} and chunks of {chunk_gaussians}."
+            f"levels of {counts} and chunks of {shown(chunk_gaussians)}."
         )
     near = near_rows(ordered[-1].scene, robust_frame(ordered[0].scene.means), environment_radii)
     return plan_part(ordered, near, chunk_gaussians=chunk_gaussians)

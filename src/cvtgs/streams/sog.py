@@ -12,6 +12,8 @@ from jaxtyping import Int
 from torch import Tensor
 
 from cvtgs.boxes import Corner
+from cvtgs.checks import checked
+from cvtgs.counts import check_whole
 from cvtgs.devices import on_host
 from cvtgs.io import load, save
 from cvtgs.io.atomic import make_folder, write_atomically
@@ -110,6 +112,7 @@ class SogFormat:
 
 
 @on_host()
+@checked
 def write_sog_stream(
     plan: StreamPlan,
     folder: str | os.PathLike[str],
@@ -134,6 +137,7 @@ def write_sog_stream(
         The written counts of each level, the finest first.
 
     Raises:
+        InvalidArgumentError: An argument has another type, or files would be empty.
         OutputExistsError: The folder holds files that may not be replaced.
         OutputError: A file cannot be written.
         InvalidSceneError: A Gaussian is not finite.
@@ -149,6 +153,7 @@ def write_sog_stream(
         ...     [len(cvtgs.load(folder, lod=lod)) for lod in (0, 1)]
         [250, 25]
     """
+    check_whole(file_gaussians, "file_gaussians")
     form = SogFormat(file_gaussians=file_gaussians)
     return write_stream(form, plan, folder, overwrite=overwrite, listener=listener)
 

@@ -3,7 +3,7 @@
 import math
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,8 @@ from typing import Any
 import torch
 
 from cvtgs.boxes import Corner
+from cvtgs.checks import checked
+from cvtgs.counts import check_whole, real_number
 from cvtgs.devices import on_host
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io import atomic_output
@@ -21,6 +23,7 @@ from cvtgs.io.limits import FORMAT_LIMITS, dropped_within
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.streams.files import StreamLevel, StreamPart, join_trees, write_stream
 from cvtgs.streams.plan import StreamNode, StreamPlan, join_boxes
+from cvtgs.text import shown
 
 __all__ = ["check_transform", "geo_transform", "write_tiles"]
 
@@ -107,6 +110,7 @@ class TilesFormat:
 
 
 @on_host()
+@checked
 def write_tiles(
     plan: StreamPlan,
     folder: str | os.PathLike[str],
@@ -136,8 +140,8 @@ def write_tiles(
         the tree; each of its tiles is counted once.
 
     Raises:
-        InvalidArgumentError: The transform is not affine and invertible, or the plan has an
-            environment, which 3D Tiles cannot hold.
+        InvalidArgumentError: The transform is not affine and invertible, tiles would be empty, the
+            plan has an environment, which 3D Tiles cannot hold, or an argument has another type.
         OutputExistsError: The folder holds files that may not be replaced.
         OutputError: A file cannot be written.
         InvalidSceneError: No Gaussian of a tile is finite.
@@ -153,6 +157,7 @@ def write_tiles(
         ...     len(cvtgs.load(f"{folder}/0_0.glb")), written[0].gaussians
         (25, 250)
     """
+    check_whole(tile_gaussians, "tile_gaussians")
     check_no_environment(bool(plan.far))
     form = TilesFormat(
         tile_gaussians=tile_gaussians,
@@ -182,10 +187,13 @@ def geo_transform(longitude: float, latitude: float, height: float = 0.0) -> tup
         >>> [round(number) for number in geo_transform(0.0, 0.0)[12:]]
         [6378137, 0, 0, 1]
     """
+    given = (longitude, latitude, height)
+    longitude, latitude, height = map(real_number, given)
     if not (abs(longitude) <= 360.0 and abs(latitude) <= 90.0 and math.isfinite(height)):
+        one, two, three = map(shown, given)
         raise InvalidArgumentError(
             "a place on Earth needs a longitude from -360 to 360 degrees, a latitude from -90 "
-            f"to 90 and a height in metres, found {longitude!r}, {latitude!r} and {height!r}."
+            f"to 90 and a height in metres, found {one}, {two} and {three}."
         )
     east, north = math.radians(longitude), math.radians(latitude)
     sin_east, cos_east = math.sin(east), math.cos(east)
@@ -211,7 +219,7 @@ def check_no_environment(has_one: bool) -> None:
 
 def check_transform(numbers: Sequence[float]) -> tuple[float, ...]:
     """Return the transform of a tileset, 16 numbers by columns; raise unless it is invertible."""
-    values = tuple(map(float, numbers))
+    values = tuple(map(real_number, numbers)) if isinstance(numbers, Iterable) else ()
     is_matrix = len(values) == 16 and all(map(math.isfinite, values))
     last = values[3::4]
     if is_matrix and last == (0.0, 0.0, 0.0, 1.0):
@@ -220,7 +228,7 @@ def check_transform(numbers: Sequence[float]) -> tuple[float, ...]:
             return values
     raise InvalidArgumentError(
         "the transform of a tileset must be 16 finite numbers, column by column: an "
-        f"invertible 4 x 4 matrix whose last row is 0, 0, 0, 1; found {list(values)[:17]}."
+        f"invertible 4 x 4 matrix whose last row is 0, 0, 0, 1; found {shown(numbers)}."
     )
 
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field
 
+from cvtgs.counts import whole_number
 from cvtgs.edit import merge
 from cvtgs.errors import FileFormatError, InvalidArgumentError
 from cvtgs.io.files import (
@@ -67,9 +68,9 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
         InvalidArgumentError: The level does not exist.
     """
     meta = validated(_LodMeta, read_json(path), str(path))
-    if not 0 <= lod < meta.lodLevels:
+    if not 0 <= whole_number(lod) < meta.lodLevels:
         raise InvalidArgumentError(
-            f"lod must be from 0 to {meta.lodLevels - 1}, the levels of {path}, found {lod}."
+            f"lod must be from 0 to {meta.lodLevels - 1}, the levels of {path}, found {shown(lod)}."
         )
     places = list(_places(meta, lod, path))
     own = [rows for level, rows in places if level == lod]
