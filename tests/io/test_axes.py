@@ -85,6 +85,8 @@ def test_unknown_axes_are_refused_before_anything_is_read(tmp_path: Path) -> Non
         load(tmp_path / "missing.ply", axes="xyz")
     with pytest.raises(InvalidArgumentError, match=text):
         save(random_scene(2), tmp_path / "a.ply", axes="xyz")
+    with pytest.raises(InvalidArgumentError, match="found ''"):
+        save(random_scene(2), tmp_path / "a.ply", axes="")
     with pytest.raises(InvalidArgumentError, match=r"found 'rrf'"):
         change_axes(random_scene(2), "rrf", "rdf")
     assert not list(tmp_path.iterdir())

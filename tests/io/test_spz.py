@@ -187,7 +187,7 @@ def test_axes_have_the_numbers_of_the_niantic_library(tmp_path: Path) -> None:
         assert struct.unpack_from("<3I", path.read_bytes(), 32) == (0xADBE0003, 4, number)
 
 
-@pytest.mark.parametrize("version", [1, 5, "4"])
+@pytest.mark.parametrize("version", [1, 5, "4", 3.0])
 def test_unknown_versions_are_not_written(tmp_path: Path, version: Version) -> None:
     with pytest.raises(InvalidArgumentError, match="must be 2, 3 or 4, found"):
         save(storable_scene(3), tmp_path / "a.spz", spz_version=version)

@@ -251,7 +251,7 @@ def save(
         raise InvalidArgumentError(f"spz_version needs an .spz to write, found {named}.")
     if isinstance(path, str | os.PathLike):
         check_output(path, overwrite)
-    axes = axes or _FILE_AXES.get(suffix, SCENE_AXES)
+    axes = _FILE_AXES.get(suffix, SCENE_AXES) if axes is None else axes
     scene = change_axes(scene, SCENE_AXES, axes)
     if suffix != ".ply" and scene.has_two_scales and not TWO_SCALES.is_in(scene.comments):
         scene = replace(scene, comments=(*scene.comments, TWO_SCALES.text))  # not by a layout

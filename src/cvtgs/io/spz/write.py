@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+from cvtgs.counts import whole_number
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.arrays import HALF_RANGE, Arrays, arrays_of, drop_largest, opacity_bytes, to_bytes
 from cvtgs.io.axes import AXES, SCENE_AXES, checked_axes
@@ -67,7 +68,7 @@ def write_spz(
         >>> gzip.decompress(file.getvalue())[:4]
         b'NGSP'
     """
-    if version not in VERSIONS:
+    if whole_number(version) not in VERSIONS:
         raise InvalidArgumentError(f"the version of an .spz must be 2, 3 or 4, found {version!r}.")
     number = 1 + AXES.index(checked_axes(axes))
     arrays = arrays_of(scene)
