@@ -342,6 +342,8 @@ def merge(scenes: Iterable[GaussianScene]) -> GaussianScene:
     comments = tuple(dict.fromkeys(line for scene in scenes for line in scene.comments))
     if not all(scene.has_two_scales for scene in scenes):
         comments = TWO_SCALES.removed_from(comments)
+    elif not same_layout and not TWO_SCALES.is_in(comments):  # then no layout says so
+        comments = (*comments, TWO_SCALES.text)
     merged = concatenate(alike)
     return replace(merged, comments=comments, layout=scenes[0].layout if same_layout else ())
 

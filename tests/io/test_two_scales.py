@@ -39,6 +39,10 @@ def test_thick_gaussians_have_no_tag() -> None:
     both = merge([tagged, random_scene(5)])
     assert both.comments == ("mine",)
     assert merge([tagged, tagged]).has_two_scales
+    flat = replace(flat_file(300, torch.float32), comments=("mine",))
+    assert merge([flat, flat]).comments == ("mine",)  # its layout says so
+    other = replace(flat, layout=flat.layout[::-1])
+    assert merge([flat, other]).comments == ("mine", TWO_SCALES.text)
     config = SimplifyConfig.from_mapping({"effects": {"flat": "off"}})
     thick = Simplifier(config=config, device="cpu").simplify(tagged, 0.1)
     assert thick.comments == ("mine",)
