@@ -65,7 +65,6 @@ def started(command: Command, folder: Path, *, limit: Callable[[], None] | None 
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(folder.parent / "torch")
         if command.blocks:
             cvtgs.outofcore.memory.block_count = lambda *_, **__: command.blocks  # type: ignore[assignment]
-            sys.modules["cvtgs.outofcore.run"].block_count = lambda *_, **__: command.blocks  # type: ignore[attr-defined]
         if limit is not None:
             limit()
         places = {"{}": str(folder), "{scheduler}": os.environ.get("FAULTS_SCHEDULER", "")}

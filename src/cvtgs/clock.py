@@ -52,6 +52,7 @@ class StageClock:
     """
 
     def __init__(self, listener: ProgressListener, device: torch.device) -> None:
+        check_listener(listener)
         self._listener = listener
         self._device = device
         self.costs: list[StageCost] = []

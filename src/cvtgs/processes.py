@@ -11,7 +11,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from types import TracebackType
-from typing import Protocol, Self, TypeVar
+from typing import Protocol, Self, TypeVar, runtime_checkable
 
 from cvtgs.errors import InvalidArgumentError, RunError
 from cvtgs.startup import load_torch
@@ -28,6 +28,7 @@ WAKE_SECONDS = 0.5  # longest wait for a result at once: on Windows, Ctrl-C does
 MOST_ON_WINDOWS = 61  # largest number of processes that a pool of Python has on Windows
 
 
+@runtime_checkable
 class Workers(Protocol):
     """Calls a function for every item, in this process (as ``map`` does) or in others."""
 

@@ -90,7 +90,6 @@ def test_a_large_scene_is_streamed_in_blocks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("cvtgs.outofcore.memory.block_count", lambda *_, **__: 2)
-    monkeypatch.setattr("cvtgs.streams.blocks.block_count", lambda *_, **__: 2)
     more = ["--stream", "3dtiles", "--workers", "1", "--rho", "1,0.1", "--place", "8.5,47.4"]
     assert main([*words, *more]) == 0
     first, _, finest, coarsest = capsys.readouterr().out.splitlines()

@@ -188,8 +188,7 @@ def test_cameras_are_part_of_the_key_of_a_job(scene, tmp_path):
 
 @pytest.fixture
 def two_blocks(monkeypatch):
-    for module in ("cvtgs.outofcore.memory", "cvtgs.outofcore.run"):
-        monkeypatch.setattr(f"{module}.block_count", lambda rows, memory, merging: BLOCKS)
+    monkeypatch.setattr("cvtgs.outofcore.memory.block_count", lambda rows, memory, merging: BLOCKS)
 
 
 @pytest.mark.slow

@@ -10,7 +10,6 @@ from typing import Any, BinaryIO, Literal
 
 import torch
 
-from cvtgs.counts import whole_number
 from cvtgs.devices import usable_device, without_spinning
 from cvtgs.errors import (
     DroppedDataWarning,
@@ -22,7 +21,7 @@ from cvtgs.errors import (
 )
 from cvtgs.io.atomic import atomic_output, check_output
 from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
-from cvtgs.io.files import is_file, scene_file
+from cvtgs.io.files import check_degree, is_file, scene_file
 from cvtgs.io.limits import FORMAT_LIMITS, Losses, losses_within
 from cvtgs.io.streams import ByteSink, ByteSource, file_of, name_of, written_to
 from cvtgs.math.spherical_harmonics import REST_COUNTS
@@ -134,8 +133,8 @@ def load(
         GaussianScene(2 Gaussians, SH degree 0, float32, cpu)
     """
     usable_device(device)
-    if sh_degree is not None and whole_number(sh_degree) not in range(len(REST_COUNTS)):
-        raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {sh_degree!r}.")
+    if sh_degree is not None:
+        check_degree(sh_degree)
     axes = None if axes is None else checked_axes(axes)
     if not isinstance(path, str | os.PathLike):
         if not hasattr(path, "read"):

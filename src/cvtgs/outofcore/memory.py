@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from cvtgs.counts import whole_number
+from cvtgs.counts import check_whole, whole_number
 from cvtgs.devices import core_count
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.ply import PlyRows
@@ -173,6 +173,16 @@ def block_count(source: PlyRows, memory: int, *, merging: int = 0) -> int:
     wanted = needed_memory(source, source.count) - BASE_BYTES
     room = (memory if memory > base else LEAST_BYTES) - base
     return SHARED_BY * math.ceil(2 * wanted / room / SHARED_BY)
+
+
+def chosen_blocks(
+    source: PlyRows, memory: int, *, wanted: int | None, most: int, merging: int = 0
+) -> int:
+    """Return the number of blocks that is wanted, else the one that memory needs; at most some."""
+    if wanted is None:
+        return min(block_count(source, memory, merging=merging), most)
+    check_whole(wanted, "blocks")
+    return min(whole_number(wanted), most)
 
 
 def worker_count(memory: int, wanted: int | None) -> int:

@@ -10,11 +10,12 @@ from pathlib import Path
 
 from cvtgs.analysis import restore_columns
 from cvtgs.analysis.effects import select_columns
-from cvtgs.boxes import Box
+from cvtgs.boxes import Box, listed
 from cvtgs.cameras import Cameras
+from cvtgs.checks import checked
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
-from cvtgs.counts import shared_out, shortfall, target_count
+from cvtgs.counts import check_whole, shared_out, shortfall, target_count
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
 from cvtgs.errors import ConfigError, DroppedDataWarning, warn
 from cvtgs.evaluation.scorer import check_seen
@@ -35,9 +36,9 @@ from cvtgs.outofcore.job import Job, Manifest, job_folder, started
 from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
 from cvtgs.outofcore.memory import (
     IMAGE_BYTES,
-    block_count,
     cell_room,
     check_memory,
+    chosen_blocks,
     memory_to_plan,
     sample_rows,
 )
@@ -60,6 +61,7 @@ SAMPLED = 10_000  # number of Gaussians that tell whether cameras look at the sc
 
 
 @on_host()
+@checked
 def simplify_file(  # noqa: PLR0913 (options by name)
     source: str | os.PathLike[str],
     output: str | os.PathLike[str],
@@ -115,7 +117,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
 
     Raises:
         ConfigError: The configuration cannot be used with blocks.
-        InvalidArgumentError: Ratio, count or boxes cannot be met.
+        InvalidArgumentError: Ratio, count or boxes cannot be met, or an argument is out of range or
+            of another type.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
         OutputExistsError: The output exists and may not be replaced.
@@ -140,6 +143,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     rows = open_rows(source, sh_degree=sh_degree, axes=source_axes)
     target = target_count(rows.count, rho, count=count, max_count=max_count)
     check_memory(memory, with_images=simplifier.config.uses_images)
+    if range_rows is not None:
+        check_whole(range_rows, "range_rows")
     room = memory or memory_to_plan()
     if simplifier.config.uses_images:
         room -= IMAGE_BYTES
@@ -149,16 +154,15 @@ def simplify_file(  # noqa: PLR0913 (options by name)
             own = find_own_cameras(_sampled(rows), source)
             cameras = None if own is None else own.cameras
     merging = finer_count(target, rows.count, simplifier.config.allocation)
-    wanted = blocks or block_count(rows, room, merging=merging)
     job = Job(
         folder="",
         source=rows,
         target=target,
-        blocks=max(1, min(int(wanted), target)),
-        boxes=tuple(boxes),
+        blocks=chosen_blocks(rows, room, wanted=blocks, most=target, merging=merging),
+        boxes=tuple(listed(boxes, Box, required="boxes must be of type Box")),
         config=simplifier.config,
         has_network=simplifier.checkpoint is not None,
-        range_rows=range_rows or rows_per_range(rows.count),
+        range_rows=rows_per_range(rows.count) if range_rows is None else range_rows,
         sample_rows=sample_rows(room),
         cell_room=cell_room(memory),
         axes=checked_axes(output_axes or SCENE_AXES) if is_plain_ply(output) else SCENE_AXES,

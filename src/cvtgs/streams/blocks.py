@@ -14,20 +14,26 @@ from jaxtyping import Int
 from torch import Tensor
 
 from cvtgs.analysis.effects import select_columns
+from cvtgs.checks import checked
 from cvtgs.clock import StageClock
-from cvtgs.counts import check_whole, shared_out, target_count, whole_number
+from cvtgs.counts import shared_out, target_count, whole_number
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, check_path, warn
 from cvtgs.grouping import finer_count
 from cvtgs.io import change_axes
 from cvtgs.io.atomic import make_folder
 from cvtgs.io.axes import SCENE_AXES, checked_axes
+from cvtgs.io.files import check_degree
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
-from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.outofcore import Workers
 from cvtgs.outofcore.job import Job, job_folder, started
-from cvtgs.outofcore.memory import block_count, memory_to_plan, sample_rows
+from cvtgs.outofcore.memory import (
+    check_memory,
+    chosen_blocks,
+    memory_to_plan,
+    sample_rows,
+)
 from cvtgs.outofcore.rows import analysis_of, read_rows
 from cvtgs.outofcore.run import check_config, rows_per_range
 from cvtgs.outofcore.sort import sort_into_blocks
@@ -133,6 +139,7 @@ def _bytes_of(path: Path, kind: str) -> int:
 
 
 @on_host()
+@checked
 def stream_file(  # noqa: PLR0913 (options by name)
     source: str | os.PathLike[str],
     folder: str | os.PathLike[str],
@@ -184,7 +191,8 @@ def stream_file(  # noqa: PLR0913 (options by name)
     Raises:
         ConfigError: The configuration renders images, which needs the whole scene in memory.
         InvalidArgumentError: A ratio is out of range, two ratios give the same size, chunks would
-            be empty, the kind does not have an option, or an argument has another type.
+            be empty, the kind does not have an option, or an argument is out of range or of another
+            type.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
         OutputExistsError: The folder holds files that may not be replaced.
@@ -203,10 +211,13 @@ def stream_file(  # noqa: PLR0913 (options by name)
     check_path(source)
     check_path(folder)
     check_environment(environment_radii)
-    _check_arguments(axes, sh_degree, memory=memory, blocks=blocks)
+    _check_axes(axes)
     form = _format(kind, axes=axes, environment_radii=environment_radii, transform=transform)
     simplifier, workers = simplifier or Simplifier(device="cpu"), workers or map
     check_config(simplifier.config, with_images=False)
+    check_memory(memory, with_images=False)
+    if sh_degree is not None:
+        check_degree(sh_degree)
     rows = open_rows(source)
     targets = sorted({target_count(rows.count, rho) for rho in rhos}, reverse=True)
     if len(targets) < len(rhos) or not targets or whole_number(chunk_gaussians) < 1:
@@ -218,12 +229,11 @@ def stream_file(  # noqa: PLR0913 (options by name)
     merged = [target for target in targets if target < rows.count] or targets
     room = memory or memory_to_plan()
     merging = finer_count(merged[0], rows.count, simplifier.config.allocation)
-    wanted = blocks or block_count(rows, room, merging=merging)
     job = Job(
         folder="",
         source=rows,
         target=merged[0],
-        blocks=max(1, min(int(wanted), targets[-1])),
+        blocks=chosen_blocks(rows, room, wanted=blocks, most=targets[-1], merging=merging),
         boxes=(),
         config=simplifier.config,
         has_network=simplifier.checkpoint is not None,
@@ -253,19 +263,13 @@ def stream_file(  # noqa: PLR0913 (options by name)
     return StreamReport(join_levels(parts), chunks, len(parts), resumed)
 
 
-def _check_arguments(axes: tuple[str, str], sh_degree: int | None, **counts: int | None) -> None:
-    """Check arguments that are used only in the middle of the work."""
+def _check_axes(axes: tuple[str, str]) -> None:
     if isinstance(axes, str) or len(axes) != 2:
         raise InvalidArgumentError(
             f"axes must be those of the input file and those of the output, found {shown(axes)}."
         )
     for name in axes:
         checked_axes(name)
-    if sh_degree is not None and whole_number(sh_degree) not in range(len(REST_COUNTS)):
-        raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {shown(sh_degree)}.")
-    for name, count in counts.items():
-        if count is not None:
-            check_whole(count, name)
 
 
 def _format(

@@ -21,7 +21,7 @@ from cvtgs.errors import (
     warn,
 )
 from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
-from cvtgs.io.files import open_input
+from cvtgs.io.files import check_degree, open_input
 from cvtgs.io.ply.header import (
     SCALARS,
     Element,
@@ -340,6 +340,8 @@ def open_rows(
     Scenes are converted from ``axes``, by default those of PLY files, and lack the SH bands above
     ``sh_degree``.
     """
+    if sh_degree is not None:
+        check_degree(sh_degree)
     name = os.fspath(path)
     with open_input(Path(path)) as file:
         header = read_header(file, name)

@@ -1,0 +1,60 @@
+"""Arguments of runs in blocks: wrong ones are named before any file is made."""
+
+from typing import Any
+
+import pytest
+
+import cvtgs
+from cvtgs import Simplifier
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.outofcore import simplify_file
+from cvtgs.streams import stream_file
+from scenes import random_scene
+
+WRONG: list[tuple[str, Any, str]] = [
+    ("blocks", 0, "blocks must be a whole number above 0, found 0."),
+    ("blocks", -3, "blocks must be a whole number above 0, found -3."),
+    ("blocks", 2.7, "blocks must be a whole number above 0, found 2.7."),
+    ("blocks", "3", "blocks must be a whole number above 0, found '3'."),
+    ("sh_degree", 5, "sh_degree must be from 0 to 3, found 5."),
+    ("sh_degree", "1", "sh_degree must be from 0 to 3, found '1'."),
+    ("workers", 3, "workers must be of type Workers or None, found int."),
+    ("listener", 3, "listener must be a function of a progress event, found 3."),
+    ("simplifier", "fast", "simplifier must be of type Simplifier or None, found str."),
+    ("memory", 10**6, "memory must be a whole number of bytes, at least "),
+]
+WRONG_OF_FILES: list[tuple[str, Any, str]] = [
+    *WRONG,
+    ("range_rows", 0, "range_rows must be a whole number above 0, found 0."),
+    ("range_rows", -5, "range_rows must be a whole number above 0, found -5."),
+    ("range_rows", 2.5, "range_rows must be a whole number above 0, found 2.5."),
+    ("boxes", "abc", "boxes must be of type Box, found 'a'."),
+    ("boxes", None, "boxes must be of type Box, found None."),
+]
+
+
+@pytest.fixture
+def source(tmp_path):
+    cvtgs.save(random_scene(300), tmp_path / "in.ply")
+    return tmp_path / "in.ply"
+
+
+def options(name: str, value: object) -> dict[str, Any]:
+    return {"blocks": 2, "simplifier": Simplifier(preset="draft", device="cpu"), name: value}
+
+
+@pytest.mark.parametrize(("name", "value", "message"), WRONG_OF_FILES)
+def test_wrong_arguments_of_a_file_are_named(source, name, value, message):
+    with pytest.raises(InvalidArgumentError) as caught:
+        simplify_file(source, source.with_name("out.ply"), 0.1, **options(name, value))
+    assert str(caught.value).startswith(message)
+    assert list(source.parent.iterdir()) == [source]
+
+
+@pytest.mark.parametrize(("name", "value", "message"), WRONG)
+def test_wrong_arguments_of_a_stream_are_named(source, name, value, message):
+    more = options(name, value)
+    with pytest.raises(InvalidArgumentError) as caught:
+        stream_file(source, source.with_name("out"), [1.0, 0.1], kind="sog", **more)
+    assert str(caught.value).startswith(message)
+    assert list(source.parent.iterdir()) == [source]
