@@ -23,10 +23,11 @@ from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import InvalidArgumentError, RunError, warn
 from cvtgs.evaluation import Comparison, EvaluationSettings, compare
 from cvtgs.evaluation.scorer import mean_of
-from cvtgs.io import load, scene_size
+from cvtgs.io import load, scene_file, scene_size
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import SimplifyReport
 from cvtgs.scene import GaussianScene
+from cvtgs.text import printable
 from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult, with_fronts
 from cvtgs.views import automatic_views, find_own_cameras
 
@@ -127,6 +128,18 @@ def tasks_of(presets: Sequence[str] | None, ratios: Sequence[float]) -> tuple[Ta
     return tasks
 
 
+def check_results(source: str | os.PathLike[str], folder: Path, tasks: Sequence[Task]) -> None:
+    """Raise if a result would replace the scene, which all tasks read."""
+    file = scene_file(source)
+    for task in tasks:
+        path = folder / task.file_name
+        if path.exists() and file.exists() and path.samefile(file):
+            raise InvalidArgumentError(
+                f"{path}: a result must not replace the scene that all presets simplify; choose "
+                f"another folder."
+            )
+
+
 def run_task(
     source: str | os.PathLike[str],
     task: Task,
@@ -143,14 +156,13 @@ def run_task(
     """
     path, report = folder / task.file_name, folder / f".{task.file_name}.json"
     words = ["--rho", repr(task.rho), "--preset", task.preset, "--device", device]
-    words += ["--report", str(report), "--overwrite", "--quiet"]
+    words += [f"--report={report}", "--overwrite", "--quiet"]  # names may begin with a dash
     words += ["--trust-sizes"] * trust_sizes
     if training is not None and SimplifyConfig.from_preset(task.preset).uses_images:
-        words += ["--cameras", str(training), "--split", "train"]
+        words += [f"--cameras={training}", "--split", "train"]
+    words += ["--", os.fspath(source), str(path)]
     try:
-        cost = run_process(
-            [sys.executable, "-m", "cvtgs", "simplify", os.fspath(source), str(path), *words]
-        )
+        cost = run_process([sys.executable, "-m", "cvtgs", "simplify", *words])
         found = SimplifyReport.model_validate_json(report.read_bytes())
     finally:
         report.unlink(missing_ok=True)
@@ -276,7 +288,8 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         Costs, scores and images.
 
     Raises:
-        CvtgsError: The scene cannot be read, or a preset or ratio is invalid.
+        CvtgsError: The scene cannot be read, a preset or ratio is invalid, or a result would
+            replace the scene.
         RunError: All runs failed.
 
     Example:
@@ -292,6 +305,8 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         [('standard 0.1', 50)]
     """
     tasks = tasks_of(presets, ratios)
+    if folder is not None:
+        check_results(source, Path(folder), tasks)
     where = chosen_device(device)
     full = load(source, trust_sizes=trust_sizes).to(where)
     views, own = cameras(full), find_own_cameras(full, source)
@@ -319,7 +334,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         for failure in failures:
             warn(f"{failure.name} failed: {failure.reason}")
         sizes = {run.task.name: run.path.stat().st_size for run in runs}
-        source_name = Path(source).name
+        source_name = printable(Path(source).name)
         comparison = compare(
             full,
             {run.task.name: load(run.path).to(where) for run in runs},
