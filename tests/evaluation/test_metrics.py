@@ -168,8 +168,13 @@ def test_autocast_does_not_change_scores():
 
 def test_names_of_scenes_are_texts():
     scene = random_scene(3)
+    cameras = automatic_views(scene, 1, width=32, height=32)
     with pytest.raises(InvalidArgumentError, match="names of scenes must be texts, found 1"):
-        evaluate(scene, {1: scene}, automatic_views(scene, 1, width=32, height=32))
+        evaluate(scene, {1: scene}, cameras)
+    with pytest.raises(InvalidArgumentError, match=r"texts that files can hold .*found 'a.udcff'"):
+        evaluate(scene, {"a\udcff": scene}, cameras)
+    with pytest.raises(InvalidArgumentError, match="names of scenes must be texts, found None"):
+        evaluate(scene, {"a": scene}, cameras, reference_name=None)
 
 
 @pytest.mark.parametrize(

@@ -217,9 +217,13 @@ def _named_scenes(
     reference: SceneLike, small: Mapping[str, SceneLike], reference_name: str
 ) -> dict[str, GaussianScene]:
     check_kinds({"small": Mapping}, {"small": small})
-    for name in small:
+    for name in (reference_name, *small):
         if not isinstance(name, str):
             raise InvalidArgumentError(f"names of scenes must be texts, found {shown(name)}.")
+        if any("\ud800" <= letter <= "\udfff" for letter in name):  # of a file name in other bytes
+            raise InvalidArgumentError(
+                f"names of scenes must be texts that files can hold (UTF-8), found {shown(name)}."
+            )
     if reference_name in small:
         raise InvalidArgumentError(
             f"the scenes must have different names; {reference_name!r} is the name of the full "
