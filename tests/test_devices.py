@@ -36,6 +36,11 @@ def test_a_named_device_is_used_as_given():
     assert chosen_device("cpu", "meta") == usable_device("cpu") == torch.device("cpu")
 
 
+def test_nothing_is_computed_without_values():
+    with pytest.raises(DeviceError, match=r"^device 'meta' cannot be used here: its tensors have"):
+        chosen_device("meta")
+
+
 def test_tensors_of_any_dtype_and_shape_move_in_one_copy():
     tensors = [
         torch.arange(12, dtype=torch.float64).view(3, 4).T,

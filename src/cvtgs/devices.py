@@ -82,9 +82,12 @@ def usable_device(device: str | torch.device) -> torch.device:
 
 
 def chosen_device(device: str | torch.device, home: str | torch.device = "cpu") -> torch.device:
-    """Return the named device; for ``auto``, CUDA (if any) for data on the CPU, else ``home``."""
+    """Return the device to compute on; for ``auto``, CUDA (if any) for the CPU, else ``home``."""
     if device != "auto":
-        return usable_device(device)
+        named = usable_device(device)
+        if named.type == "meta":
+            raise DeviceError("device 'meta' cannot be used here: its tensors have no values.")
+        return named
     home = torch.device(home)
     return torch.device("cuda") if home.type == "cpu" and torch.cuda.is_available() else home
 

@@ -342,6 +342,8 @@ def check_scene(scene: object) -> None:
 def as_scene(scene: SceneLike, name: str = "scene") -> GaussianScene:
     """Return a scene unchanged, or read it from a path; raise for anything else."""
     if isinstance(scene, GaussianScene):
+        if scene.device.type == "meta":
+            raise InvalidSceneError(f"{name} must hold values, found tensors on the device meta.")
         return scene
     if isinstance(scene, str | os.PathLike):
         read: GaussianScene = resolve_name("cvtgs.io.formats:load")(scene)

@@ -9,8 +9,8 @@ from cvtgs.boxes import MaskLike
 from cvtgs.cameras import Cameras
 from cvtgs.clock import check_listener
 from cvtgs.config import SimplifyConfig
-from cvtgs.devices import usable_device
-from cvtgs.errors import DeviceError, InvalidArgumentError
+from cvtgs.devices import chosen_device
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.mergenet.checkpoint import checkpoint_for
 from cvtgs.prepared import Prepared
 from cvtgs.progress import ProgressListener, silent
@@ -61,9 +61,7 @@ class Simplifier:
         self.config = chosen or SimplifyConfig(
             preset="standard" if self.checkpoint is None else self.checkpoint.info.preset
         )
-        self._device = None if device == "auto" else usable_device(device)
-        if self._device is not None and self._device.type == "meta":
-            raise DeviceError("device 'meta' cannot be used here: its tensors have no values.")
+        self._device = None if device == "auto" else chosen_device(device)
         self._listener = listener
 
     def __repr__(self) -> str:

@@ -5,9 +5,11 @@ import math
 import pytest
 import torch
 
+import cvtgs
 from cvtgs import GaussianScene, ProgressEvent, Simplifier, SimplifyConfig
-from cvtgs.errors import CvtgsError, DeviceError
+from cvtgs.errors import CvtgsError, DeviceError, InvalidSceneError
 from cvtgs.validity import invalid_rows
+from refine_cases import ring
 from scenes import assert_standard, random_scene, same_bits
 
 each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])
@@ -156,6 +158,21 @@ def test_devices_that_do_not_exist_are_errors(device):
     assert str(caught.value).endswith(".")
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 200
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda scene: cvtgs.simplify(scene, 0.1, device="cpu"),
+        lambda scene: cvtgs.simplify(scene, 0.1),
+        cvtgs.describe,
+        lambda scene: cvtgs.render(scene, ring(2)),
+        lambda scene: cvtgs.evaluate(scene, {"same": scene}, ring(2)),
+    ],
+)
+def test_a_scene_without_values_is_an_error(call):
+    with pytest.raises(InvalidSceneError, match="must hold values, found tensors on the device me"):
+        call(random_scene(20).to("meta"))
 
 
 def test_missing_cuda_is_an_error():
