@@ -229,6 +229,35 @@ def test_the_camera_of_a_view_equals_that_by_hand() -> None:
     torch.testing.assert_close(cameras.Ks[0], torch.tensor(wanted, dtype=torch.float64))
 
 
+@pytest.mark.parametrize(
+    ("aspect", "size"),
+    [(1.0, (480, 480)), (0.5, (240, 480)), (1e-9, (16, 480)), (1e9, (480, 16))],
+)
+def test_images_of_a_view_are_small_whatever_the_window(
+    aspect: float, size: tuple[int, int]
+) -> None:
+    cameras = camera_of((1, 0, 0, 0), (0, 0, 0), fov=1.0, aspect=aspect)
+    assert (cameras.width, cameras.height) == size
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"aspect": 0.0},
+        {"aspect": math.nan},
+        {"aspect": math.inf},
+        {"fov": 0.0},
+        {"fov": math.pi},
+        {"wxyz": (0, 0, 0, 0)},
+        {"position": (math.inf, 0, 0)},
+    ],
+)
+def test_a_view_that_shows_nothing_is_an_error_on_the_page(page: Any, odd: dict[str, Any]) -> None:
+    seen = {"wxyz": (1, 0, 0, 0), "position": (0, 0, -4), "fov": 0.8, "aspect": 1.5} | odd
+    control(page, "PSNR of this view").call(SimpleNamespace(camera=SimpleNamespace(**seen)))
+    assert notes(page).startswith("**a view must have a size, a direction and a field of view")
+
+
 def test_a_scene_that_is_not_there_yet_is_an_error(scene: GaussianScene, tmp_path: Path) -> None:
     viewer = SceneViewer(scene, device="cpu")
     view = camera_of((1, 0, 0, 0), (0, 0, -4), fov=0.8, aspect=1.5)

@@ -16,7 +16,7 @@ from cvtgs.prepared import Prepared
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
 from cvtgs.simplifier import Simplifier
-from cvtgs.text import counted, size_text
+from cvtgs.text import counted, shown, size_text
 from cvtgs.validity import valid_part
 
 __all__ = ["SceneViewer", "ShownScene"]
@@ -24,7 +24,7 @@ __all__ = ["SceneViewer", "ShownScene"]
 FULL, SIMPLIFIED = "full scene", "simplified"
 
 WARM_RATIO = 0.5  # largest ratio to prepare for: above an eighth, pairs of single Gaussians merge
-SCORE_SIDE = 480  # longer side of scored images, pixels
+SCORE_SIDE, LEAST_SIDE = 480, 16  # longer side of scored images, and least of the other, pixels
 
 
 class ShownScene(NamedTuple):
@@ -169,14 +169,22 @@ def camera_of(
 
     Returns:
         One camera, with images of at most ``SCORE_SIDE`` pixels.
+
+    Raises:
+        InvalidArgumentError: Nothing can be seen, as in a window without height.
     """
+    numbers = (*wxyz, *position, fov, aspect)
+    if not (all(map(math.isfinite, numbers)) and any(wxyz) and aspect > 0 and 0 < fov < math.pi):
+        raise InvalidArgumentError(
+            f"a view must have a size, a direction and a field of view, found aspect {aspect:g}, "
+            f"rotation {shown(wxyz)} and {fov:g} radians."
+        )
     quat = torch.tensor([wxyz], dtype=torch.float64, device="cpu")
     rotation = rotation_matrices(quat)[0]
     view = torch.eye(4, dtype=torch.float64, device="cpu")
     view[:3, :3] = rotation.T
     view[:3, 3] = -rotation.T @ torch.tensor(position, dtype=torch.float64, device="cpu")
-    width = SCORE_SIDE if aspect >= 1 else max(16, round(SCORE_SIDE * aspect))
-    height = max(16, round(width / aspect))
+    width, height = (max(LEAST_SIDE, round(SCORE_SIDE * min(1.0, x))) for x in (aspect, 1 / aspect))
     focal = height / 2 / math.tan(fov / 2)
     intrinsics = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
     return Cameras(

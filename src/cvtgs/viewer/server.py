@@ -326,11 +326,14 @@ class ViewerServer:
     def _score(self, event: "viser.GuiEvent[Any]") -> None:
         camera = None if event.client is None else event.client.camera
         if camera is not None:
-            cameras = camera_of(
-                tuple(camera.wxyz), tuple(camera.position), fov=camera.fov, aspect=camera.aspect
-            )
-            name = self._shown.value
-            self._try(lambda: f"{name}: {self._viewer.score(name, cameras):.2f} dB in this view")
+            self._try(lambda: self._score_view(camera))
+
+    def _score_view(self, camera: "viser.CameraHandle") -> str:
+        cameras = camera_of(
+            tuple(camera.wxyz), tuple(camera.position), fov=camera.fov, aspect=camera.aspect
+        )
+        name = self._shown.value
+        return f"{name}: {self._viewer.score(name, cameras):.2f} dB in this view"
 
     def _save(self) -> str:
         return self._viewer.save(self._shown.value, self._path.value.strip())
