@@ -194,6 +194,22 @@ def test_everything_that_a_result_depends_on_changes_the_key_of_a_job(tmp_path, 
     assert len(keys) == len(others) + 6
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("is_gone", [True, False])
+def test_a_damaged_network_is_written_again(source, tmp_path, is_gone):
+    output, whole = tmp_path / "out.ply", tmp_path / "whole.ply"
+    simplify_file(source, whole, 0.05, blocks=8)
+    with pytest.raises(StoppedError):
+        simplify_file(source, output, 0.05, blocks=8, listener=stop_in_blocks)
+    network = next(tmp_path.glob(".out.ply.blocks/*/network.safetensors"))
+    if is_gone:
+        network.unlink()
+    else:
+        os.truncate(network, 1000)
+    assert simplify_file(source, output, 0.05, blocks=8).resumed_blocks == 3
+    assert output.read_bytes() == whole.read_bytes()
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     "kind",

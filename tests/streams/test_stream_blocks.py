@@ -146,6 +146,17 @@ def test_a_damaged_part_is_written_again(tmp_path: Path, source: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["targets.json", "scan.safetensors"])
+def test_a_stream_without_its_plan_starts_over(tmp_path: Path, source: Path, name: str) -> None:
+    with pytest.raises(StoppedError):
+        stream(source, tmp_path / "out", workers=until(2, []))
+    plan = next((tmp_path / ".out.blocks").rglob(name))
+    os.truncate(plan, plan.stat().st_size // 2)
+    assert stream(source, tmp_path / "out").resumed_blocks == 0
+    assert len(load(tmp_path / "out")) == 4000
+
+
+@pytest.mark.slow
 def test_other_options_start_the_stream_over(tmp_path: Path, source: Path) -> None:
     with pytest.raises(StoppedError):
         stream(source, tmp_path / "out", workers=until(2, []))

@@ -326,7 +326,7 @@ class Job:
 def started(
     job: Job, workers: Workers, clock: StageClock, checkpoint: Checkpoint | None, *, resumes: bool
 ) -> Iterator[None]:
-    """Make the folder of a job and write its network, unless it resumes; check the workers.
+    """Make the folder of a job, unless it resumes; check the workers, and write the network.
 
     The folder is removed if the job fails before there is anything to resume.
     """
@@ -337,7 +337,7 @@ def started(
         if check is not None:  # workers on other machines
             with clock.stage("workers"):
                 check(job)
-        if not resumes and checkpoint is not None:
+        if checkpoint is not None:  # a resumed job may find it damaged
             job.write_network(checkpoint)
         yield
     except CvtgsError:

@@ -130,6 +130,15 @@ class StreamJob:
         found: list[list[int]] = json.loads(self.job.path("targets.json").read_bytes())["targets"]
         return found
 
+    def can_resume(self) -> bool:
+        """Return whether the folder holds all sorted rows, their scan, and the targets."""
+        try:
+            self.job.read_scan()
+            self.targets()
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
+        return self.job.has_sorted_rows()
+
 
 def _bytes_of(path: Path, kind: str) -> int:
     """Return the bytes of a file that an index names; for a SOG, those of its folder."""
@@ -302,7 +311,7 @@ def _run(
 ) -> tuple[list[StreamPart], int]:
     """Sort the file and write the missing parts; return all parts and the number resumed."""
     job = spec.job
-    resumes = job.has_sorted_rows() and job.path("targets.json").exists()
+    resumes = spec.can_resume()
     with started(job, workers, clock, simplifier.checkpoint, resumes=resumes):
         if not resumes:
             with one_thread():
