@@ -1,6 +1,7 @@
 """Several sizes of one scene: exact counts, the same as single runs, files."""
 
 import json
+import math
 
 import pytest
 import torch
@@ -119,10 +120,24 @@ def test_wrong_arguments_are_refused_before_files_are_written(scene, simplifier,
         ([], [], "levels to write must be at least one, found none"),
         (levels, [0.01], r"rhos must hold one ratio per level, 2; found 1\."),
         (levels, [0.01, 0.01], r"rhos must differ, since they name the files, found 0\.01 twice"),
+        (levels, [0.01, -3], r"rho must be above 0 and at most 1; found -3\."),
+        (levels, [0.01, math.nan], r"rho must be above 0 and at most 1; found nan\."),
+        (levels, [0.01, "a"], r"rho must be a number above 0 and at most 1; found 'a'\."),
+        (levels, 0.01, r"ratios must be a list of numbers, found 0\.01\."),
     ):
         with pytest.raises(InvalidArgumentError, match=message):
             write_levels(those, tmp_path / "out", rhos=rhos, source="a.ply")
     assert not (tmp_path / "out").exists()
+
+
+def test_the_index_has_ratios_of_float32_as_they_were_written(scene, simplifier, tmp_path):
+    rhos = torch.tensor([0.02, 0.01])
+    levels = simplifier.levels(scene, rhos)
+    index = write_levels(levels, tmp_path / "out", rhos=rhos, source="a.ply")
+    assert [(level.rho, level.file) for level in index.levels] == [
+        (0.02, "rho_0.02.ply"),
+        (0.01, "rho_0.01.ply"),
+    ]
 
 
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")

@@ -3,7 +3,7 @@
 import math
 import operator
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
@@ -102,6 +102,19 @@ def written(number: "float | Tensor") -> str:
         lacking = str(value.dtype) == "torch.bfloat16"  # in numpy
         value = (value.float() if lacking else value).numpy().reshape(())[()]
     return str(value) if "float" in type(value).__name__ else str(float(value))
+
+
+def written_ratios(rhos: Iterable[float]) -> list[float]:
+    """Return ratios as the decimal numbers that were written; raise unless all are in (0, 1]."""
+    try:
+        ratios = list(rhos)
+    except TypeError:  # also a tensor of one number
+        raise InvalidArgumentError(
+            f"ratios must be a list of numbers, found {shown(rhos)}."
+        ) from None
+    for rho in ratios:
+        target_count(1, rho)
+    return [float(written(rho)) for rho in ratios]
 
 
 def check_share(value: object, name: str) -> None:

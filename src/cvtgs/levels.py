@@ -9,7 +9,7 @@ import torch
 
 from cvtgs.boxes import Corner
 from cvtgs.config.base import Record
-from cvtgs.counts import written
+from cvtgs.counts import written, written_ratios
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import Evaluation, SceneScores
 from cvtgs.evaluation.scorer import mean_of
@@ -144,7 +144,8 @@ def write_levels(
         The index, the finest level first.
 
     Raises:
-        InvalidArgumentError: There is no level, or the ratios are not one per level, all different.
+        InvalidArgumentError: There is no level, or the ratios are not one per level, all different
+            and in (0, 1].
         OutputExistsError: A file exists and may not be replaced.
         OutputError: A file cannot be written.
 
@@ -159,19 +160,20 @@ def write_levels(
     """
     if not levels:
         raise InvalidArgumentError("levels to write must be at least one, found none.")
-    if len(rhos) != len(levels):
+    ratios = written_ratios(rhos)
+    if len(ratios) != len(levels):
         raise InvalidArgumentError(
-            f"rhos must hold one ratio per level, {len(levels)}; found {len(rhos)}."
+            f"rhos must hold one ratio per level, {len(levels)}; found {len(ratios)}."
         )
-    place, names = Path(folder), level_names(rhos, suffix)
-    twice = [written(rho) for rho, name in zip(rhos, names, strict=True) if names.count(name) > 1]
+    place, names = Path(folder), level_names(ratios, suffix)
+    twice = [rho for rho in ratios if ratios.count(rho) > 1]
     if twice:
         raise InvalidArgumentError(
             f"rhos must differ, since they name the files, found {twice[0]} twice."
         )
     check_levels(place, names, overwrite=overwrite)
     entries = []
-    for level, rho, name in zip(levels, rhos, names, strict=True):
+    for level, rho, name in zip(levels, ratios, names, strict=True):
         save(level.scene, place / name, overwrite=overwrite, axes=axes)
         entries.append(_entry(level, rho, place / name))
     index = LevelsIndex(

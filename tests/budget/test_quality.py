@@ -188,6 +188,10 @@ def test_a_goal_out_of_reach_is_an_error(full, views, simplifier):
     [
         ({}, "give either psnr or ssim, found both or neither."),
         ({"psnr": 30.0, "ssim": 0.9}, "give either psnr or ssim, found both or neither."),
+        (
+            {"psnr": 30.0, "listener": 3},
+            "listener must be a function of a progress event, found 3.",
+        ),
         ({"psnr": 0.0}, "the PSNR to reach must be above 0 and at most 60 dB, found 0.0."),
         ({"psnr": math.nan}, "the PSNR to reach must be above 0 and at most 60 dB, found nan."),
         ({"psnr": "30"}, "the PSNR to reach must be above 0 and at most 60 dB, found '30'."),

@@ -11,6 +11,7 @@ from cvtgs.budget.calibrate import CANDIDATES, cost_model
 from cvtgs.budget.costs import CostModel, Work
 from cvtgs.cameras import Cameras
 from cvtgs.checks import checked
+from cvtgs.clock import check_listener
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import real_number, target_count
 from cvtgs.errors import GoalError, InvalidArgumentError
@@ -163,6 +164,7 @@ def find_count(
         >>> found.psnr >= 18 and len(found.scene) < 400
         True
     """
+    check_listener(listener)
     target = checked_target(psnr, ssim=ssim)
     simplifier = simplifier or Simplifier()
     prepared = simplifier.prepare(scene, cameras=cameras)

@@ -18,7 +18,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.config.simplify import unknown_preset
-from cvtgs.counts import target_count, written
+from cvtgs.counts import written_ratios
 from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import InvalidArgumentError, RunError, warn
 from cvtgs.evaluation import Comparison, EvaluationSettings, compare
@@ -114,10 +114,7 @@ def tasks_of(presets: Sequence[str] | None, ratios: Sequence[float]) -> tuple[Ta
     for name in names:
         if name not in PRESETS:
             raise unknown_preset(name)
-    for rho in ratios:
-        target_count(1, rho)
-    numbers = [float(written(rho)) for rho in ratios]
-    tasks = tuple(Task(preset=name, rho=rho) for rho in numbers for name in names)
+    tasks = tuple(Task(preset=name, rho=rho) for rho in written_ratios(ratios) for name in names)
     if not tasks:
         raise InvalidArgumentError("give at least one preset and one ratio.")
     twice = [task.name for number, task in enumerate(tasks) if task in tasks[:number]]
