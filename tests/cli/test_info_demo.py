@@ -125,11 +125,13 @@ def test_demo_refuses_a_folder_that_cannot_be_created(tmp_path, capsys):
     assert "must be a folder or a new path" in capsys.readouterr().err
 
 
-def test_demo_replaces_only_files_of_an_earlier_demo(tmp_path, capsys):
-    (tmp_path / "index.html").write_text("mine")
+@pytest.mark.parametrize("name", ["index.html", "sheet.png", "errors.png", "small_0.1.ply"])
+def test_demo_replaces_only_files_of_an_earlier_demo(tmp_path, capsys, name):
+    (tmp_path / name).write_text("mine")
     assert main(["demo", "-o", str(tmp_path), "--count", "50"]) == 1
-    assert "a new folder or that of an earlier demo, found index.html" in capsys.readouterr().err
-    assert (tmp_path / "index.html").read_text() == "mine"
+    assert f"a new folder or that of an earlier demo, found {name}" in capsys.readouterr().err
+    assert (tmp_path / name).read_text() == "mine"
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_effects_are_no_matter_of_checkpoints(capsys):

@@ -100,11 +100,13 @@ def demo(options: argparse.Namespace) -> None:
 
 def _check_folder(folder: Path) -> None:
     """Raise if a folder holds other files than those of an earlier demo."""
+    from cvtgs.evaluation.comparison_files import ERRORS, PAGE, SHEET
+
     full = folder / "full.ply"
     start = b""
     with suppress(OSError), full.open("rb") as file:
         start = file.read(_HEADER)
-    names = ["full.ply", "index.html", *(f"small_{rho:g}.ply" for rho in RATIOS)]
+    names = ["full.ply", PAGE, SHEET, ERRORS, *(f"small_{rho:g}.ply" for rho in RATIOS)]
     found = next((name for name in names if (folder / name).exists()), None)
     if found is not None and _MADE_BY not in start:
         raise OutputExistsError(
