@@ -287,6 +287,19 @@ def test_the_command_writes_a_page(
     assert "a.html: the output must not exist yet" in capsys.readouterr().err
 
 
+def test_a_page_does_not_replace_a_scene(
+    tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, other = tmp_path / "a.ply", tmp_path / "b.ply"
+    save(scene, one)
+    save(scene, other)
+    for page in (one, other):
+        words = ["view", str(one), str(other), "--page", str(page), "--overwrite"]
+        assert main(words) == 1
+        assert "--page and the scenes must be different files, found" in capsys.readouterr().err
+    assert len(load(one)) == len(load(other)) == len(scene)
+
+
 def test_a_page_without_the_simplified_scene_is_an_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

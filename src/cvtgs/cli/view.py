@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING
 import cvtgs
 from cvtgs.cli.display import say
 from cvtgs.cli.jobs import expanded
-from cvtgs.cli.options import PRESET_NAMES, AddParser, add_options, file, ratio
+from cvtgs.cli.options import (
+    PRESET_NAMES,
+    AddParser,
+    add_options,
+    file,
+    is_same_file,
+    ratio,
+)
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import write_atomically
 
@@ -94,10 +101,14 @@ def view(options: argparse.Namespace) -> None:
     cvtgs.SimplifyConfig.compose(preset=preset)
     if not 0 < options.port < 1 << 16:
         raise InvalidArgumentError(f"--port must be from 1 to 65535, found {options.port}.")
-    if options.page is not None:
-        cvtgs.io.check_output(options.page, options.overwrite)
     small = expanded(options.small)
     names = [options.input, *small]
+    if options.page is not None:
+        cvtgs.io.check_output(options.page, options.overwrite)
+        if any(is_same_file(options.page, path) for path in names):
+            raise InvalidArgumentError(
+                f"--page and the scenes must be different files, found {options.page} for both."
+            )
     check_viewer()
     scene, *others = (cvtgs.load(path, trust_sizes=options.trust_sizes) for path in names)
     named = {str(path): other for path, other in zip(small, others, strict=True)}
