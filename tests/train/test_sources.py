@@ -55,6 +55,18 @@ def test_only_scenes_for_validation_have_cameras(tmp_path):
     assert cameras == {"a": None, "exam": tmp_path / "exam.transforms.json"}
 
 
+def test_hidden_files_are_no_scenes(tmp_path):
+    """An interrupted run in blocks leaves such files beside its output."""
+    write_scenes(tmp_path, ["a", "exam", ".b"], 50)
+    (tmp_path / ".out.ply.blocks").mkdir()
+    write_scenes(tmp_path / ".out.ply.blocks", ["small_00000"], 50)
+    write_scenes(tmp_path / "more", ["c"], 50)
+    sources = find_sources(tiny_data(tmp_path), seed=0)
+    assert [source.name for source in sources] == ["a", "exam", "c"]
+    hidden = write_scenes(tmp_path / ".scenes", ["d", "exam"], 50)  # named, so not hidden
+    assert [source.name for source in find_sources(tiny_data(hidden), seed=0)] == ["d", "exam"]
+
+
 def test_several_folders_are_searched_in_order(tmp_path):
     first, second = (write_scenes(tmp_path / name, [name], 5) for name in ("z", "exam"))
     sources = find_sources(tiny_data(first, folders=(first, second)), seed=0)

@@ -18,7 +18,8 @@ class DataConfig(Section):
     """Training scenes, and validation scenes that decide when to stop.
 
     Attributes:
-        folders: Folders of PLY files; relative paths start at the folder of the configuration file.
+        folders: Folders of PLY files, of which hidden ones do not count; relative paths start at
+            the folder of the configuration file.
         validation: Names of files (without .ply) for validation only; if none is named, every
             fifth file, starting with the second. They are rendered with the cameras of
             ``NAME.transforms.json`` if it is in the same folder.

@@ -78,10 +78,15 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
 def _files_in(folder: Path) -> list[Path]:
     if not is_folder(folder):
         raise ConfigError(f"data.folders: {folder} is not a folder.")
-    files = sorted(folder.rglob("*.ply"))
+    files = sorted(path for path in folder.rglob("*.ply") if not _is_hidden(path, folder))
     if not files:
         raise ConfigError(f"data.folders: {folder} holds no PLY file.")
     return files
+
+
+def _is_hidden(path: Path, folder: Path) -> bool:
+    """Return whether a file is hidden in a folder, as the blocks of an interrupted run are."""
+    return any(part.startswith(".") for part in path.relative_to(folder).parts)
 
 
 def _from_files(
