@@ -189,6 +189,22 @@ def test_keys_that_are_no_text_are_errors():
     assert error_of({1: 2}) == "1: is not a known setting."
 
 
+@pytest.mark.parametrize("value", [True, False])
+@pytest.mark.parametrize(
+    ("section", "key", "kind"),
+    [
+        ("cvt", "iterations", "integer"),
+        ("cvt", "color", "number"),
+        ("refine", "steps", "integer"),
+        ("filter", "min_opacity", "number"),
+    ],
+)
+def test_truth_values_are_no_numbers(section, key, kind, value):
+    wanted = f"{section}.{key}: input should be a valid {kind}, unable to parse string as a"
+    assert error_of({section: {key: value}}).startswith(wanted)
+    assert SimplifyConfig(cvt={"perspective": value}).cvt.perspective is value
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 @pytest.mark.parametrize("key", ["color", "weight_floor", "tolerance"])
 def test_numbers_that_are_not_finite_are_errors(key, value):

@@ -42,6 +42,14 @@ class Section(pydantic.BaseModel):
         except pydantic.ValidationError as error:
             raise ConfigError(explain(error)) from None
 
+    @pydantic.field_validator("*", mode="before")
+    @classmethod
+    def _refuse_truth_values(cls, value: Any, info: pydantic.ValidationInfo) -> Any:
+        """Make texts, which are no numbers, of true and false for numbers: they equal 1 and 0."""
+        field = cls.model_fields[info.field_name or ""]
+        is_wrong = isinstance(value, bool) and field.annotation in (int, float)
+        return str(value) if is_wrong else value
+
     # Sections in other sections are checked without a call of __init__, so keys keep their path.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
