@@ -17,6 +17,8 @@ from cvtgs import GaussianScene, Simplifier, load, save
 from cvtgs.cli.main import main
 from cvtgs.errors import ConfigError, DeviceError, InvalidArgumentError, MissingDependencyError
 from cvtgs.viewer import SceneViewer, ShownScene, ViewerServer, camera_of, scene_page
+from cvtgs.viewer.scenes import FULL
+from cvtgs.viewer.server import SceneNode
 from scenes import random_scene, same_bits
 
 FACTS, NOTES = "markdown 0", "markdown 7"
@@ -270,6 +272,23 @@ def test_a_scene_that_is_not_there_yet_is_an_error(scene: GaussianScene, tmp_pat
 def test_names_reserved_by_the_viewer_are_refused(scene: GaussianScene) -> None:
     with pytest.raises(InvalidArgumentError, match="must not be named 'simplified'; rename it"):
         SceneViewer(scene, {"simplified": scene})
+
+
+def test_scenes_can_be_switched_while_one_is_drawn(
+    scene: GaussianScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    draw, counts = SceneNode.draw, list[int]()
+
+    def switch_and_draw(node: SceneNode, drawn: GaussianScene, *, visible: bool) -> None:
+        control(SimpleNamespace(stand=viser_stand_in.ViserServer.latest), "show").value = FULL
+        draw(node, drawn, visible=visible)
+        counts.append(len(drawn))
+
+    monkeypatch.setattr(SceneNode, "draw", switch_and_draw)
+    server = ViewerServer(SceneViewer(scene, device="cpu"), rho=0.01)
+    server.finish()
+    server.close()
+    assert counts == [500, 5]
 
 
 @pytest.mark.slow

@@ -312,10 +312,13 @@ class ViewerServer:
         return ""
 
     def _draw(self, name: str, scene: GaussianScene) -> None:
-        if name not in self._nodes:
+        """Draw a scene; controls are used in other threads, which see only nodes that are drawn."""
+        node = self._nodes.get(name)
+        if node is None:
             path = f"/scene {len(self._nodes)}"
-            self._nodes[name] = SceneNode(self._server, name, path, label=self._label)
-        self._nodes[name].draw(scene, visible=self._shown.value == name)
+            node = SceneNode(self._server, name, path, label=self._label)
+        node.draw(scene, visible=self._shown.value == name)
+        self._nodes = {**self._nodes, name: node}
 
     def _show(self) -> None:
         for name, node in self._nodes.items():
