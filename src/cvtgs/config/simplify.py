@@ -35,12 +35,13 @@ MATCHED: Mapping[str, Any] = {
     "visibility": {**IMAGES, "views": 32},
     "match": {"opacity_rounds": 1},
     "refine": {
-        "steps": 60,
-        "rates": {"means": 0.03, "quats": 0.012, "log_scales": 0.015},
-        "half_after": 48,
+        "steps": 45,
+        "images_per_step": 2,
+        "rates": {"means": 0.042, "quats": 0.017, "log_scales": 0.021},
+        "half_after": 60,
         **IMAGES,
         "steps_per_image": 100,
-        "check_every": 30,
+        "check_every": 15,
     },
 }
 
