@@ -26,7 +26,7 @@ from torch import Tensor
 import cvtgs
 import cvtgs.rendering
 from benchmarks.measuring import write_file
-from cvtgs.cameras import Cameras, look_at
+from cvtgs.cameras import Cameras, join_cameras, look_at
 from cvtgs.evaluation.scorer import ViewImages, render_views
 from cvtgs.views.layout import find_layout
 
@@ -35,6 +35,11 @@ RINGS = ((8, 10, 14, 2.9), (4, 35, 32, 2.1))
 
 LIFT = 0.15
 """Height of the point that the rings look at, above the middle of the scene, in radii."""
+
+LOWEST, HIGHEST, NEAREST = 3, 38, 2.0
+"""Elevations of spread cameras in degrees, and their smallest distance in robust radii."""
+
+GOLDEN_ANGLE = 180 * (3 - math.sqrt(5))  # degrees
 
 SIDE, FIELD = 400, 50
 """Side of the images of the rings in pixels, and the field of view in degrees."""
@@ -111,6 +116,25 @@ def ring_cameras(scene: cvtgs.GaussianScene) -> Cameras:
         width=SIDE,
         height=SIDE,
     )
+
+
+def spread_cameras(scene: cvtgs.GaussianScene, count: int) -> Cameras:
+    """Return cameras from where people would look, none of them those of the rings."""
+    turns = torch.arange(count, dtype=torch.float64) * GOLDEN_ANGLE
+    random = torch.Generator().manual_seed(5)
+    found = []
+    for turn in turns:
+        height, distance = torch.rand(2, generator=random).tolist()
+        found.append(
+            cameras_around(
+                scene,
+                turn[None] % 360,
+                elevation=LOWEST + (HIGHEST - LOWEST) * height,
+                distance=NEAREST + distance,
+                lift=LIFT,
+            )
+        )
+    return join_cameras(found)
 
 
 def beside_format(cameras: Cameras) -> dict[str, Any]:

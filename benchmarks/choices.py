@@ -14,7 +14,8 @@ that do not know the tag. Every line has PSNR, SSIM, the mean absolute error of 
 to the base, and CPU seconds of the simplification alone, in one process. Means over the scenes
 come last. ``--base merge.network=false`` changes the base. Images of full scenes are cached in
 ``--cache``, so that a second run starts at once. ``--pages DIR`` writes a page per scene and ratio
-with maps of the colour and alpha errors.
+with maps of the colour and alpha errors. ``--fit 48`` gives presets with images that many cameras
+around the scene, none of which score, as if they were those of the capture.
 """
 
 import argparse
@@ -26,7 +27,7 @@ from pathlib import Path
 from statistics import fmean
 
 import cvtgs
-from benchmarks.cameras import CACHE, FullImages, cameras_beside
+from benchmarks.cameras import CACHE, FullImages, cameras_beside, spread_cameras
 from benchmarks.measuring import warm_up, write_file
 from benchmarks.quality import mean_or_none
 from cvtgs.cameras import Cameras
@@ -115,6 +116,9 @@ def parser() -> argparse.ArgumentParser:
         "--base", nargs="+", default=[], metavar="KEY=VALUE", help="settings of all configurations"
     )
     found.add_argument("--automatic", action="store_true", help="use automatic views")
+    found.add_argument(
+        "--fit", type=int, metavar="COUNT", help="number of cameras to give to the simplification"
+    )
     found.add_argument("--size", type=int, help="longer side of the images, pixels")
     found.add_argument("--ignore-tag", action="store_true", help="ignore the tag mip in images")
     found.add_argument(
@@ -142,6 +146,7 @@ def measure(
     cameras = views_of(file, scene, options)
     metrics = chosen_metrics(options.lpips, (cameras.width, cameras.height))
     full = FullImages(scene=scene, cameras=cameras, folder=options.cache)
+    given = spread_cameras(scene, options.fit) if options.fit else None
     for rho in options.rho:
         kept: dict[str, cvtgs.GaussianScene] = {}
         for name, settings in configurations.items():
@@ -150,7 +155,7 @@ def measure(
             config = cvtgs.SimplifyConfig.compose(preset=preset, settings=values)
             simplifier = cvtgs.Simplifier(checkpoint, config=config)
             start = time.process_time()
-            small = simplifier.simplify(scene, rho)
+            small = simplifier.simplify(scene, rho, cameras=given)
             seconds = time.process_time() - start
             scores = scene_scores(name, len(small), list(score(small, full, metrics)))
             assert scores.alpha_error is not None

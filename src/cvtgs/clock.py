@@ -55,13 +55,14 @@ class StageClock:
         check_listener(listener)
         self._listener = listener
         self._device = device
-        self.costs: list[StageCost] = []
+        self._costs: dict[str, StageCost] = {}
 
     @contextmanager
     def stage(self, name: str, total: int = 1) -> Iterator[Callable[[int], None]]:
         """Measure the body of the ``with`` statement; yield a function of the finished steps.
 
-        The event of the last step is sent when the stage ends.
+        The event of the last step is sent when the stage ends. A stage that runs again adds to its
+        cost.
         """
 
         def send(done: int) -> None:
@@ -80,18 +81,22 @@ class StageClock:
         yield advance
         if on_cuda:
             torch.cuda.synchronize(self._device)
-        self.costs.append(
-            StageCost(
-                stage=name,
-                seconds=time.perf_counter() - wall,
-                cpu_seconds=time.process_time() - cpu,
-                peak_memory_bytes=peak_memory_bytes(),
-                peak_device_memory_bytes=(
-                    torch.cuda.max_memory_allocated(self._device) if on_cuda else 0
-                ),
-            )
+        nothing = StageCost(stage=name, seconds=0.0, cpu_seconds=0.0, peak_memory_bytes=0)
+        before = self._costs.get(name, nothing)
+        peak = torch.cuda.max_memory_allocated(self._device) if on_cuda else 0
+        self._costs[name] = StageCost(
+            stage=name,
+            seconds=before.seconds + time.perf_counter() - wall,
+            cpu_seconds=before.cpu_seconds + time.process_time() - cpu,
+            peak_memory_bytes=peak_memory_bytes(),
+            peak_device_memory_bytes=max(before.peak_device_memory_bytes, peak),
         )
         send(total)
+
+    @property
+    def costs(self) -> list[StageCost]:
+        """The costs of the stages so far, in the order of their first runs."""
+        return list(self._costs.values())
 
 
 def peak_memory_bytes() -> int:

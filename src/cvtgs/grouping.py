@@ -16,6 +16,7 @@ from cvtgs.cvt.nearest import search_device
 from cvtgs.devices import move_together
 from cvtgs.filters import filter_rows
 from cvtgs.math.frames import RobustFrame, morton_order
+from cvtgs.math.segments import segment_ids
 from cvtgs.scene import GaussianScene
 
 MEMBERS_PER_CELL = 4  # if cells would have fewer Gaussians on average, the tessellation is skipped
@@ -24,6 +25,10 @@ COLOR_CELLS = 10_000  # the number of cells at which ``cvt.color`` applies uncha
 
 FULL_RELIEF = 0.1
 """Ratio of cells to Gaussians from which on ``allocation.far_relief`` applies unchanged."""
+
+NEAR = 6  # number of neighbouring cells whose errors count, by half, for a cell
+SMALL_ERROR = 0.02  # share of the mean error that is added to those of all cells
+LARGEST_FACTOR = 12.0  # limit of the factors on masses, and of their inverse
 
 
 class WeightedRows(NamedTuple):
@@ -101,6 +106,51 @@ def weigh_rows(
         masses=analysis.areas.index_select(0, rows) * opacities,
         apparent_masses=masses,
     )
+
+
+def with_importance(points: WeightedRows, importance: Float[Tensor, "n"] | None) -> WeightedRows:
+    """Multiply apparent masses, which scale the costs of merging, by factors of all Gaussians."""
+    if importance is None:
+        return points
+    masses = points.apparent_masses * importance.index_select(0, points.rows)
+    return points._replace(apparent_masses=masses, moments=None)
+
+
+def importance_by_errors(
+    small: GaussianScene,
+    partition: cells.Partition,
+    *,
+    errors: Float[Tensor, "m"],
+    pixels: Float[Tensor, "m"],
+    count: int,
+    power: float,
+) -> Float[Tensor, "n"]:
+    """Return factors on the masses in the costs of merging: larger where cells have larger errors.
+
+    The errors of neighbouring cells count by half, since errors are also caused by what a cell does
+    not cover. Cells that images hardly show have factors near 1.
+
+    Args:
+        small: One Gaussian per cell.
+        partition: Rows of every cell.
+        errors: Squared errors that each cell causes in images.
+        pixels: Contribution of each cell to these images, pixels.
+        count: Number of Gaussians of the full scene.
+        power: Power of the errors.
+
+    Returns:
+        Factor of each Gaussian of the full scene; 1 for Gaussians in no cell.
+    """
+    near = cvt.nearest_neighbors(small.means, NEAR)
+    errors = errors.nan_to_num(0.0, 0.0, 0.0)  # images of extreme scenes overflow
+    errors = errors + 0.5 * errors[near].sum(dim=1)
+    logs = (errors + SMALL_ERROR * errors.mean()).clamp_min(1e-300).log()
+    seen = pixels.double() / (pixels + 1.0)
+    logs = logs - (seen * logs).sum() / seen.sum().clamp_min(1e-300)
+    factors = (power * seen * logs).exp().clamp(1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
+    found = factors.new_ones(count)
+    found[partition.order] = factors[segment_ids(partition.offsets, len(partition.order))]
+    return found
 
 
 def tessellate_rows(

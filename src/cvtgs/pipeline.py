@@ -19,7 +19,14 @@ from cvtgs.config import MergeConfig, SimplifyConfig
 from cvtgs.cvt.nearest import search_name
 from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
-from cvtgs.grouping import OrderedRows, allocate, collect_cells, tessellate_rows, weigh_rows
+from cvtgs.grouping import (
+    OrderedRows,
+    allocate,
+    collect_cells,
+    tessellate_rows,
+    weigh_rows,
+    with_importance,
+)
 from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import Net, correct_cells
 from cvtgs.report import CellStatistics, MatchReport
@@ -99,6 +106,7 @@ def reduce_scene(
         rows, left_out, left_out_mass_share = filter_rows(used, analysis, target, config.filter)
     with clock.stage("weigh"):
         points = weigh_rows(used, rows, analysis, config, ordered=ordered)
+        points = with_importance(points, analysis.importance)
     del rows  # frees memory
     with clock.stage("tessellate", config.cvt.iterations + 1) as advance:
         tessellation = tessellate_rows(points, analysis, target, config, on_iteration=advance)

@@ -1,6 +1,7 @@
 """Prepared: a scene to simplify repeatedly, with a fallback if the device lacks memory."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
@@ -24,7 +25,7 @@ from cvtgs.devices import (
     without_spinning,
 )
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.grouping import OrderedRows, add_neighbors, order_rows
+from cvtgs.grouping import OrderedRows, add_neighbors, importance_by_errors, order_rows
 from cvtgs.mergenet import Checkpoint, Net
 from cvtgs.pipeline import Reduced, level_facts, reduce_scene
 from cvtgs.progress import ProgressListener, silent
@@ -164,15 +165,7 @@ class Prepared:
         first, rest = kept.nonzero()[:, 0], (~kept).nonzero()[:, 0]
         protected = with_finite_opacities(valid.select(first))
         part, room = analysis.select(rest), target - len(protected)
-        others = reduce_scene(
-            valid.select(rest),
-            part,
-            room,
-            self._config,
-            net=self._net,
-            clock=clock,
-            total=self._total - len(protected),
-        )
+        others = self._reduce(valid.select(rest), part, room, clock, kept=protected)
         reduced = others._replace(scene=concatenate([protected, others.scene]))
         reduced = self._match(reduced, part, clock)
         return self._result(reduced, checked, analysis, target, clock, kept_count=len(protected))
@@ -254,21 +247,50 @@ class Prepared:
         return checked, analysis
 
     def _reduce(
-        self, valid: GaussianScene, analysis: SceneAnalysis, target: int, clock: StageClock
+        self,
+        valid: GaussianScene,
+        analysis: SceneAnalysis,
+        target: int,
+        clock: StageClock,
+        *,
+        kept: GaussianScene | None = None,
     ) -> Reduced:
-        """Run the stages after the analysis, with what earlier runs have cached."""
-        self._order(valid, analysis, target, clock)
-        self._has_run = self._has_run or target < len(valid)
-        return reduce_scene(
+        """Run the stages after the analysis, with what earlier runs have cached of whole scenes.
+
+        With given cameras they run twice, the second time with fewer merges where the first result
+        errs. Errors in generated views are not always where people look.
+        """
+        if kept is None:
+            self._order(valid, analysis, target, clock)
+            self._has_run = self._has_run or target < len(valid)
+        reduce = partial(
+            reduce_scene,
             valid,
-            analysis,
-            target,
-            self._config,
+            target=target,
+            config=self._config,
             net=self._net,
             clock=clock,
-            total=self._total,
-            ordered=self._ordered,
+            total=self._total if kept is None else self._total - len(kept),
+            ordered=self._ordered if kept is None else None,
         )
+        found, power, observed = reduce(analysis), self._config.match.error_power, analysis.observed
+        if self._cameras is None or power == 0 or observed is None or found.partition is None:
+            return found
+        from cvtgs.matching import cell_contributions  # noqa: PLC0415 (few need it)
+        from cvtgs.rendering import error_shares  # noqa: PLC0415 (few need it)
+
+        with clock.stage("errors"):
+            drawn = found.scene if kept is None else concatenate([kept, found.scene])
+            errors = error_shares(drop_unused_bands(drawn, analysis.plan), observed)
+            importance = importance_by_errors(
+                found.scene,
+                found.partition,
+                errors=errors[len(drawn) - len(found.scene) :],
+                pixels=cell_contributions(observed.contributions, found.partition),
+                count=len(valid),
+                power=power,
+            )
+        return reduce(replace(analysis, importance=importance))
 
     def _order(
         self, valid: GaussianScene, analysis: SceneAnalysis, target: int, clock: StageClock

@@ -54,6 +54,24 @@ def test_rows_have_the_scores_of_evaluate_and_differences_to_the_base(file, tmp_
     assert float(last[3]) == pytest.approx(other["psnr"] - base["psnr"], abs=0.006)
 
 
+def test_presets_can_be_fitted_to_cameras_that_do_not_score(file, tmp_path):
+    place = tmp_path / "rows.json"
+    small = ["visibility.size=32", "visibility.stride=1", "visibility.views=4", "refine.steps=0"]
+    common = ["--rho", "0.1", "--cache", str(tmp_path / "kept"), "--json", str(place), "--fit", "5"]
+    choices.main([str(file), *common, "--base", "preset=matched", *small])
+    (row,) = json.loads(place.read_text())
+    cameras = camera_files.spread_cameras(SCENE, 5)
+    assert len(cameras) == 5
+    assert len(torch.unique(cameras.centers, dim=0)) == 5
+    settings = dict(word.split("=") for word in small)
+    config = cvtgs.SimplifyConfig.compose(preset="matched", settings=settings)
+    found = cvtgs.Simplifier(config=config).simplify(SCENE, 0.1, cameras=cameras)
+    scores = cvtgs.evaluate(
+        SCENE, {"small": found}, VIEWS, settings=EvaluationSettings(lpips="off")
+    ).scenes[0]
+    assert row["psnr"] == pytest.approx(scores.psnr.mean, abs=1e-3)
+
+
 def test_a_checkpoint_is_a_choice(file, tmp_path):
     place = tmp_path / "rows.json"
     common = ["--rho", "0.1", "--cache", str(tmp_path / "kept"), "--json", str(place)]

@@ -10,7 +10,7 @@ from cvtgs.analysis import analyze
 from cvtgs.analysis.analyze import measure_visibility
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.rendering import blending_weights, contributions, observe, render
+from cvtgs.rendering import blending_weights, contributions, error_shares, observe, render
 from cvtgs.views import automatic_views
 from render_cases import around, backends, one_camera
 from scenes import random_scene
@@ -52,6 +52,29 @@ def test_contributions_ignore_colours_and_sum_to_the_alpha_of_images(backend):
     assert torch.equal(found, contributions(dark, cameras, backend=backend))
     alpha = cvtgs.render(scene, cameras, backend="torch").alpha
     assert float(found.sum()) == pytest.approx(float(alpha.sum()), rel=1e-9)
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_shares_of_errors_are_weighted_like_the_colours_of_an_image(backend):
+    """Relative to the mean error of each image; a channel below 0, drawn as 0, does not matter."""
+    scene = random_scene(50, degree=1, dtype=torch.float64)
+    colors = scene.sh0.clone()
+    colors.view(50, 3)[:10, 1] -= 100.0
+    small, cameras = scene.with_tensors(sh0=colors), around(3, 24, 20)
+    views = observe(scene, cameras)
+    wanted = torch.zeros(50, dtype=torch.float64)
+    for camera, truth in zip(cameras.singles(), views.rgb, strict=True):
+        image = render(small, camera, backend="torch").rgb[0].clamp(0, 1)
+        squares = (image - truth.clamp(0, 1)).square().sum(dim=2, keepdim=True)
+        weights = blending_weights(small, camera, backend="torch")
+        wanted += weights.collect(squares.expand(-1, -1, 3))[:, 0] / squares.mean()
+    found = error_shares(small, views, backend=backend)
+    assert found.dtype == torch.float64
+    assert found.tolist() == pytest.approx(wanted.tolist(), rel=1e-5, abs=1e-8)
+    assert float(found.sum()) > 100.0
+    assert float(error_shares(scene, views, backend=views.backend).abs().max()) == 0.0
+    with pytest.raises(InvalidArgumentError, match="views must be ObservedViews"):
+        error_shares(scene, cameras)
 
 
 def test_hidden_gaussians_contribute_nothing():

@@ -94,6 +94,19 @@ def test_refinement_gains():
     assert refined.report.gain > 0
 
 
+@pytest.mark.slow
+def test_errors_in_given_cameras_count_on_the_device():
+    scene = made(300)
+    cameras = automatic_views(scene, 4, width=32, height=24)
+    settings = {"preset": "matched", "refine": {"steps": 0}, "visibility": {"size": 32}}
+    simplifier = Simplifier(config=SimplifyConfig.from_mapping(settings), device=DEVICE)
+    keep = torch.arange(300) % 50 == 0
+    for kept in (None, keep):
+        small, report = simplifier.run(scene.to(DEVICE), 0.1, cameras=cameras, keep=kept)
+        assert (len(small), small.device.type) == (30, "cuda")
+        assert "errors" in [stage.stage for stage in report.stages]
+
+
 @pytest.mark.long
 def test_a_preset_that_refines_works_on_the_device():
     changes = {"steps": 2, "check_every": 2, "size": 32, "heldout": 4, "batch": 4}

@@ -188,12 +188,16 @@ class MatchConfig(Section):
         color_ridge: Ridge that holds colours where they were, as a share of the weight that the
             images give them.
         band_ridge: Factor on the ridge for SH bands above the constant one.
+        error_power: With given cameras, cells are allocated twice: the masses in the costs of
+            merging are multiplied by this power of the error that a first result has there; 0
+            allocates once.
     """
 
     opacity_rounds: int = pydantic.Field(default=0, ge=0)
     color_iterations: int = pydantic.Field(default=0, ge=0)
     color_ridge: Ridge = 0.25
     band_ridge: Ridge = 8.0
+    error_power: float = pydantic.Field(default=0.0, ge=0.0, le=2.0)
 
     @property
     def enabled(self) -> bool:

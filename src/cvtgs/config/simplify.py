@@ -33,7 +33,7 @@ IMAGES: Mapping[str, Any] = {"size": 400, "stride": 2, "fine_factor": 2}
 
 MATCHED: Mapping[str, Any] = {
     "visibility": {**IMAGES, "views": 32},
-    "match": {"opacity_rounds": 1},
+    "match": {"opacity_rounds": 1, "error_power": 1.0},
     "refine": {
         "steps": 45,
         "images_per_step": 2,

@@ -10,6 +10,7 @@ from cvtgs.rendering.render import (
     Rendering,
     blending_weights,
     contributions,
+    error_shares,
     observe,
     render,
 )
@@ -22,6 +23,7 @@ __all__ = [
     "blending_weights",
     "choose_backend",
     "contributions",
+    "error_shares",
     "observe",
     "render",
 ]
