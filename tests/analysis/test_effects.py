@@ -7,8 +7,8 @@ import pydantic
 import pytest
 import torch
 
-from cvtgs import EffectPlan, GaussianScene, SimplifyConfig
-from cvtgs.analysis import plan_effects
+from cvtgs import EffectPlan, GaussianScene, SimplifyConfig, concatenate
+from cvtgs.analysis import analyze, plan_effects
 from cvtgs.analysis.effects import (
     BAND_LOSS,
     DUPLICATE_SHARE,
@@ -179,6 +179,20 @@ def test_an_object_is_bounded():
     plan = plan_of(random_scene(1000))
     assert not plan.unbounded.active
     assert 0 <= plan.unbounded.figure < UNBOUNDED_SHARE
+
+
+def test_giants_that_are_never_drawn_do_not_make_a_scene_unbounded():
+    scene = random_scene(1000)
+    unseen = scene[:10]
+    unseen = unseen.with_tensors(
+        means=unseen.means + 50.0,
+        log_scales=torch.full((10, 3), 10.0),
+        logit_opacities=torch.full((10,), 0.003).logit(),
+    )
+    both = concatenate([scene, unseen])
+    plain, found = (analyze(one, SimplifyConfig()).plan.unbounded for one in (scene, both))
+    assert found.figure == pytest.approx(plain.figure)
+    assert (found.active, found.strength) == (False, 0.0)
 
 
 def test_a_choice_overrides_the_decision_but_not_the_figure():

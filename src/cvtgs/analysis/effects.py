@@ -133,7 +133,7 @@ def plan_effects(
     choices = config.effects
     apparent = masses if apparent_masses is None else apparent_masses
     shares = [
-        far_share(distances, masses),
+        far_share(distances, masses * drawn_rows(scene.opacities)),
         haze_share(scene.opacities, apparent, config),
         duplicate_share(scene.means, scene.sh0),
     ]
