@@ -158,6 +158,28 @@ def test_directions_that_do_not_exist_are_refused(target, up, text):
         look_at(eyes, targets, torch.tensor(up))
 
 
+@pytest.mark.parametrize("size", [1e-30, 1e-20, 1e20, 1e30])
+def test_targets_may_be_at_any_distance(size):
+    eyes, up = torch.zeros(1, 3), torch.tensor([0.0, -1.0, 0.0])
+    target = torch.tensor([[1.0, 2.0, 3.0]])
+    found = look_at(eyes, size * target, size * up)
+    torch.testing.assert_close(found, look_at(eyes, target, up), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("eyes", "targets", "text"),
+    [
+        ([[0.0, 0, 0]], torch.ones(1, 3), "eyes must be a tensor of floats of shape (c, 3), found"),
+        (torch.zeros(1, 3).int(), torch.ones(1, 3), "found torch.int32 of shape (1, 3)."),
+        (torch.zeros(2, 4), torch.ones(2, 4), "found torch.float32 of shape (2, 4)."),
+    ],
+)
+def test_wrong_positions(eyes, targets, text):
+    with pytest.raises(InvalidArgumentError) as caught:
+        look_at(eyes, targets, torch.tensor([0.0, -1.0, 0.0]))
+    assert text in str(caught.value)
+
+
 def test_positions_may_have_several_dtypes():
     eyes, targets = torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 5.0]], dtype=torch.float64)
     found = look_at(eyes, targets, torch.tensor([0.0, -1.0, 0.0]))

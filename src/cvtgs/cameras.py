@@ -14,6 +14,7 @@ from cvtgs.checks import check_kinds, checked, row_numbers
 from cvtgs.counts import check_whole, spread_rows, whole_number
 from cvtgs.devices import usable_device, without_autocast
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.math.frames import unit_vectors
 from cvtgs.text import shown
 
 
@@ -350,6 +351,7 @@ def view_scales(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "c"]:
 
 
 @without_autocast()
+@checked
 def look_at(
     eyes: Float[Tensor, "c 3"], targets: Float[Tensor, "c 3"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "c 4 4"]:
@@ -364,8 +366,8 @@ def look_at(
         World-to-camera matrices with OpenCV axes; a camera that looks along ``up`` gets another up.
 
     Raises:
-        InvalidArgumentError: A target is at the position of its camera, ``up`` is 0, or a number is
-            not finite.
+        InvalidArgumentError: A target is at the position of its camera, ``up`` is 0, a number is
+            not finite, or shapes or types do not fit.
 
     Example:
         >>> up = torch.tensor([0.0, -1.0, 0.0])
@@ -374,9 +376,8 @@ def look_at(
     """
     dtype = torch.promote_types(torch.promote_types(eyes.dtype, targets.dtype), up.dtype)
     eyes, targets, up = eyes.to(dtype), targets.to(dtype), up.to(dtype)
-    tiny = torch.finfo(dtype).tiny  # by default, normalize leaves short vectors short
-    forward = torch.nn.functional.normalize(targets - eyes, dim=1, eps=tiny)
-    upright = torch.nn.functional.normalize(up, dim=0, eps=tiny).expand_as(forward)
+    forward = unit_vectors(targets - eyes)
+    upright = unit_vectors(up[None]).expand_as(forward)
     for vectors, wish in (
         (forward, "targets must be finite and differ from the positions of their cameras"),
         (upright, "up must be a finite direction other than 0"),

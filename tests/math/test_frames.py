@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import oracles
-from cvtgs.math.frames import BITS, RobustFrame, morton_order, robust_frame
+from cvtgs.math.frames import BITS, RobustFrame, morton_order, robust_frame, unit_vectors
 
 UNIT = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
 
@@ -130,6 +130,20 @@ def test_points_on_a_line_come_in_order():
     points = torch.zeros(1000, 3, dtype=torch.float64)
     points[:, 1] = torch.randperm(1000, generator=torch.Generator().manual_seed(0)).double()
     assert points[morton_order(points), 1].tolist() == list(range(1000))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_points_may_lie_at_both_ends_of_the_range_of_numbers(dtype):
+    most = torch.finfo(dtype).max
+    points = most * torch.tensor([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0], [-0.5, 0, 0]], dtype=dtype)
+    assert morton_order(points).tolist() == [0, 3, 1, 2]
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e-20, 1.0, 1e20, 1e30])
+def test_vectors_of_any_length_become_unit_vectors(size):
+    found = unit_vectors(size * torch.tensor([[1.0, -2.0, 2.0], [0.0, 0.0, -1.0]]))
+    wanted = torch.tensor([[1 / 3, -2 / 3, 2 / 3], [0.0, 0.0, -1.0]])
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6)
 
 
 def test_neighbours_on_the_curve_are_near():

@@ -108,6 +108,26 @@ def _radius(distances: Float[Tensor, "n"]) -> float:
     return float(distances.kthvalue(rank).values) if rank else 0.0
 
 
+def unit_vectors(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Scale vectors to unit length.
+
+    A power of two is divided out first, so that the squares of tiny and huge ones stay finite and
+    above 0, and all others have the same bits as without.
+
+    Args:
+        vectors: Finite vectors other than 0.
+
+    Returns:
+        Vectors of the same direction.
+
+    Example:
+        >>> unit_vectors(torch.tensor([[0.0, 0.0, 1e-30]])).tolist()
+        [[0.0, 0.0, 1.0]]
+    """
+    exponents = torch.frexp(vectors.abs().amax(dim=1, keepdim=True)).exponent
+    return torch.nn.functional.normalize(torch.ldexp(vectors, -exponents), dim=1)
+
+
 def morton_order(
     points: Float[Tensor, "n 3"], ties: Float[Tensor, "n"] | None = None
 ) -> Int[Tensor, "n"]:
@@ -125,13 +145,13 @@ def morton_order(
         >>> morton_order(torch.tensor([[1.0, 1, 1], [0, 0, 0], [1, 0, 0]])).tolist()
         [1, 2, 0]
     """
-    low = points.amin(dim=0)
-    side = (points.amax(dim=0) - low).amax().clamp_min(torch.finfo(points.dtype).tiny)
+    low = points.amin(dim=0) / 2  # halves, since the difference of large numbers may be infinite
+    side = (points.amax(dim=0) / 2 - low).amax().clamp_min(torch.finfo(points.dtype).tiny)
     code = torch.zeros(len(points), dtype=torch.int64, device=points.device)
     for part in row_chunks(len(points), CHUNK, points.device):  # these fit into a cache
         for axis in range(3):
-            steps = ((points[part, axis] - low[axis]) / side * (2**BITS - 1)).to(torch.int64)
-            code[part] |= _spread_bits(steps) << axis
+            steps = (points[part, axis] / 2 - low[axis]) / side * (2**BITS - 1)
+            code[part] |= _spread_bits(steps.to(torch.int64)) << axis
     codes, order = torch.sort(code, stable=True)
     if ties is not None and code.device.type != "cpu":  # more work, but no synchronization
         rows = torch.sort(ties, stable=True).indices
