@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cvtgs.checks import check_kinds
 from cvtgs.errors import InvalidArgumentError, check_path, input_errors
 from cvtgs.text import MOST_LETTERS, shortened, shown
 
@@ -126,7 +127,8 @@ def inside(boxes: Sequence[Box] | Box, means: Float[Tensor, "n 3"]) -> Bool[Tens
         The mask.
 
     Raises:
-        InvalidArgumentError: A box is something else, or positions are not of shape ``(n, 3)``.
+        InvalidArgumentError: A box is something else, or positions are no floats of shape
+            ``(n, 3)``.
 
     Example:
         >>> box = Box(min=(0, 0, 0), max=(1, 1, 1))
@@ -134,9 +136,7 @@ def inside(boxes: Sequence[Box] | Box, means: Float[Tensor, "n 3"]) -> Bool[Tens
         [True, False]
     """
     boxes = listed(boxes, Box, required="boxes must be of type Box")
-    if not isinstance(means, Tensor) or means.ndim != 2 or means.shape[1] != 3:
-        shape = tuple(means.shape) if isinstance(means, Tensor) else type(means).__name__
-        raise InvalidArgumentError(f"means must be a tensor of shape (n, 3), found {shape}.")
+    check_kinds({"means": Float[Tensor, "n 3"]}, {"means": means})
     found = torch.zeros(len(means), dtype=torch.bool, device=means.device)
     for box in boxes:
         low, high = (means.new_tensor(corner) for corner in (box.min, box.max))

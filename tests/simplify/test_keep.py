@@ -137,10 +137,12 @@ def test_boxes_include_their_faces():
     [
         (None, torch.zeros(2, 3), "boxes must be of type Box, found None."),
         ([(0, 1)], torch.zeros(2, 3), "boxes must be of type Box, found (0, 1)."),
-        ([], torch.zeros(2, 2), "means must be a tensor of shape (n, 3), found (2, 2)."),
-        ([], torch.zeros(2, 3).numpy(), "means must be a tensor of shape (n, 3), found ndarray."),
+        ([], torch.zeros(2, 2), "means must be a tensor of floats of shape (n, 3), found "
+         "torch.float32 of shape (2, 2)."),
+        ([], torch.zeros(2, 3).numpy(), "floats of shape (n, 3), found ndarray."),
+        ([], torch.zeros(2, 3).int(), "found torch.int32 of shape (2, 3)."),
     ],
-)
+)  # fmt: skip
 def test_boxes_and_centres_are_checked(boxes, points, text):
     with pytest.raises(InvalidArgumentError, match=re.escape(text)):
         inside(boxes, points)
