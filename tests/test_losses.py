@@ -188,12 +188,15 @@ def test_no_images_are_refused(loss) -> None:
 
 
 def test_weights_out_of_range_are_refused() -> None:
-    for weight in (-0.1, 1.5, math.nan):
+    for weight in (-0.1, 1.5, math.nan, "a", None):
         with pytest.raises(InvalidArgumentError, match="ssim_weight must be from 0 to 1, found"):
             image_loss(ZEROS, ZEROS, ssim_weight=weight)
-    for weight in (-0.1, math.inf, math.nan):
+    for weight in (-0.1, math.inf, math.nan, "a", None):
         with pytest.raises(InvalidArgumentError, match="gradient_weight must be a finite number"):
             image_loss(ZEROS, ZEROS, gradient_weight=weight)
+        for name in ("squared_weight", "image_weight", "ssim_weight"):
+            with pytest.raises(InvalidArgumentError, match=f"{name} must be a finite number"):
+                relative_loss(ZEROS, ZEROS, **{name: weight})
 
 
 @pytest.mark.parametrize("loss", LOSSES)

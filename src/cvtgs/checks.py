@@ -75,7 +75,7 @@ def _found(value: object) -> str:
     return type(value).__name__
 
 
-def check_range(values: Tensor, most: int, name: str) -> None:
+def check_range(values: Tensor, most: float, name: str) -> None:
     """Raise unless all values are from 0 to a number; those on other devices than CPUs pass."""
     if values.device.type == "cpu" and len(values):
         low, high = (end.item() for end in values.aminmax())

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.checks import check_kinds
+from cvtgs.counts import real_number
 from cvtgs.devices import without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import positive_log
@@ -186,12 +187,9 @@ def image_loss(
         >>> round(image_loss(grey, white, ssim_weight=0.0).item(), 4)
         0.5
     """
-    if not 0 <= ssim_weight <= 1:
+    if not 0 <= real_number(ssim_weight) <= 1:
         raise InvalidArgumentError(f"ssim_weight must be from 0 to 1, found {ssim_weight!r}.")
-    if not 0 <= gradient_weight < math.inf:
-        raise InvalidArgumentError(
-            f"gradient_weight must be a finite number of at least 0, found {gradient_weight!r}."
-        )
+    _check_weights(gradient_weight=gradient_weight)
     check_pair(prediction, target, least=SSIM_WINDOW if ssim_weight else 1)
     dissimilarity = 1 - _ssim(prediction, target) if ssim_weight else 0.0
     return _image_loss(prediction, target, dissimilarity, ssim_weight, gradient_weight).mean()
@@ -222,8 +220,8 @@ def relative_loss(
         A scalar, negative for good images; differentiable in both.
 
     Raises:
-        InvalidArgumentError: Shape, dtype or device do not fit, or the images are smaller than
-            the SSIM window of 11 pixels.
+        InvalidArgumentError: A weight is out of range, shape, dtype or device do not fit, or the
+            images are smaller than the SSIM window of 11 pixels.
 
     Example:
         >>> import torch
@@ -231,6 +229,9 @@ def relative_loss(
         >>> round(relative_loss(grey, white, image_weight=0.0).item(), 3)
         -0.693
     """
+    _check_weights(
+        squared_weight=squared_weight, image_weight=image_weight, ssim_weight=ssim_weight
+    )
     uses_ssim = bool(image_weight or ssim_weight)
     check_pair(prediction, target, least=SSIM_WINDOW if uses_ssim else 1)
     loss = prediction.new_zeros(len(prediction))
@@ -259,6 +260,14 @@ def _image_loss(
     if gradient_weight:
         loss = loss + gradient_weight * _gradient(prediction, target)
     return loss
+
+
+def _check_weights(**weights: float) -> None:
+    for name, weight in weights.items():
+        if not 0 <= real_number(weight) < math.inf:
+            raise InvalidArgumentError(
+                f"{name} must be a finite number of at least 0, found {weight!r}."
+            )
 
 
 def check_pair(

@@ -179,6 +179,13 @@ def test_iterations_are_reported():
     assert told == [1, 2, 3, 4]
 
 
+def test_labels_that_fill_empty_cells_may_be_int32():
+    labels = torch.zeros(3, dtype=torch.int32)
+    found, squared, refilled = fill_empty_cells(labels, torch.ones(3), torch.arange(3.0), 3)
+    assert (found.tolist(), found.dtype) == ([0, 2, 1], torch.int32)
+    assert (squared.tolist(), refilled) == ([0.0, 0.0, 0.0], 2)
+
+
 P, W, CONFIG = torch.randn(20, 3), torch.ones(20), TessellationConfig()
 LABELS = torch.zeros(20, dtype=torch.int64)
 BAD_ROW = torch.arange(20)[:, None] == 3
@@ -224,6 +231,8 @@ def many_iterations(**changes):
          "least 0, found an energy of -"),
         (lambda: fill_empty_cells(LABELS, W, W, 21), "20 points, found 21."),
         (lambda: fill_empty_cells(LABELS - 1, W, W, 5), "labels must be between 0 and 4"),
+        (lambda: fill_empty_cells(LABELS, torch.nan * W, W, 20), "weights times squared distances "
+         "must be between 0 and inf, found nan to nan."),
     ],
 )  # fmt: skip
 def test_wrong_arguments(call, text):

@@ -79,6 +79,12 @@ def test_other_counts_are_errors(count):
     )
 
 
+@pytest.mark.parametrize("degree", [-1, 4, 1.5, "2"])
+def test_other_degrees_are_errors(degree):
+    with pytest.raises(InvalidArgumentError, match=r"the SH degree must be from 0 to 3, found"):
+        rest_basis(random_directions(3), degree)
+
+
 def test_gradients():
     directions = random_directions(3).requires_grad_()
     assert torch.autograd.gradcheck(lambda d: rest_basis(d, 3), (directions,))

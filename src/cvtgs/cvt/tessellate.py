@@ -67,8 +67,8 @@ def tessellate(
         Labels and sites; exactly ``count`` cells, none empty.
 
     Raises:
-        InvalidArgumentError: ``count`` is outside 1 to n, shapes do not fit together, a weight is
-            negative, or a value is not finite.
+        InvalidArgumentError: ``count`` is outside 1 to n, shapes do not fit together, or, if
+            ``count`` is below n, a weight is negative or a value is not finite.
 
     Example:
         >>> points = torch.tensor([[0.0, 0, 0], [5, 0, 0], [5.1, 0, 0]])
@@ -351,7 +351,7 @@ def fill_empty_cells(
 
     Raises:
         InvalidArgumentError: Shapes do not fit together, ``count`` is outside 1 to n, or (on the
-            host) a label is out of range.
+            host) a label is out of range, or a weight times a squared distance is negative or NaN.
 
     Example:
         >>> labels, _, refilled = fill_empty_cells(
@@ -367,11 +367,12 @@ def fill_empty_cells(
     if len(empty) == 0:
         return labels, squared, 0
     cost = weights * squared
+    check_range(cost, math.inf, "weights times squared distances")
     cheapest = label_argmin(cost, labels, count)[members > 0]
     movable = torch.ones(len(labels), dtype=torch.bool, device=labels.device)
     movable[cheapest] = False
     candidates = movable.nonzero()[:, 0]
     moved = candidates[smallest_rows(-cost[candidates], len(empty))]
     labels, squared = labels.clone(), squared.clone()
-    labels[moved], squared[moved] = empty, 0.0
+    labels[moved], squared[moved] = empty.to(labels.dtype), 0.0
     return labels, squared, len(empty)

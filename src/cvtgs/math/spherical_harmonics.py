@@ -69,10 +69,15 @@ def rest_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "
     Returns:
         Values, k in {0, 3, 8, 15}.
 
+    Raises:
+        InvalidArgumentError: The degree is not from 0 to 3.
+
     Example:
         >>> rest_basis(torch.tensor([[0.0, 0.0, 1.0]]), 1)
         tensor([[-0.0000, 0.4886, -0.0000]])
     """
+    if degree not in range(len(REST_COUNTS)):
+        raise InvalidArgumentError(f"the SH degree must be from 0 to 3, found {degree!r}.")
     x, y, z = directions.unbind(1)
     columns: list[Tensor] = []
     if degree > 0:
