@@ -99,7 +99,7 @@ def test_a_pair_that_images_hardly_show_merges_first():
 
 def cost_of_a_pair(groups, config):
     table = torch.cat([torch.atleast_2d(values).float() for values in groups])
-    (cost,) = merge_pairs.__globals__["_pair_costs"](
+    (cost,) = merge_pairs.__wrapped__.__globals__["_pair_costs"](
         table, torch.tensor([0]), torch.tensor([1]), config
     )
     return float(cost)
@@ -199,14 +199,14 @@ def test_disjoint_pairs_equal_those_of_a_loop_over_all_pairs(kind, wanted):
     if kind == "ascending":
         first, second = torch.arange(199), torch.arange(1, 200)
         costs = torch.arange(199.0)
-    take = merge_pairs.__globals__["_cheapest_disjoint"]
+    take = merge_pairs.__wrapped__.__globals__["_cheapest_disjoint"]
     found = take(first, second, costs, wanted, 200)
     pairs = list(zip(*(ends.tolist() for ends in found), strict=True))
     assert pairs == greedy(first, second, costs, wanted)
 
 
 def test_each_pair_appears_once_in_ascending_order():
-    pairs_of = merge_pairs.__globals__["_distinct_pairs"]
+    pairs_of = merge_pairs.__wrapped__.__globals__["_distinct_pairs"]
     first, second = torch.tensor([4, 2, 9, 2, 3, 0]), torch.tensor([2, 4, 0, 9, 3, 9])
     keys = pairs_of(first, second)
     assert [(key >> 32, key % 2**32) for key in keys.tolist()] == [(0, 9), (2, 4), (2, 9)]
@@ -305,7 +305,7 @@ def test_colours_count_more_where_cells_are_small():
 
 def test_contrast_is_that_of_neighbours_by_hand():
     """Half of the mean squared difference: one of two neighbours differs by 0.3 in each channel."""
-    contrast = merge_pairs.__globals__["_relative_contrast"]
+    contrast = merge_pairs.__wrapped__.__globals__["_relative_contrast"]
     near = torch.tensor([[1], [0], [3], [2]])
     groups = points([0.0, 1.0, 5.0, 5.5], colors=[0.1, 0.4, 0.7, 0.7])
     assert contrast(groups.colors, near) == pytest.approx(math.sqrt(0.5 * 0.5 * 3 * 0.3**2) / 0.2)
@@ -318,13 +318,13 @@ def test_contrast_is_that_of_neighbours_by_hand():
 def watched_costs(monkeypatch, *names):
     """Return a list that gets these weights whenever costs of pairs are computed."""
     seen = []
-    costs = merge_pairs.__globals__["_pair_costs"]
+    costs = merge_pairs.__wrapped__.__globals__["_pair_costs"]
 
     def noted(table, first, second, config):
         seen.append(tuple(getattr(config, name) for name in names))
         return costs(table, first, second, config)
 
-    monkeypatch.setitem(merge_pairs.__globals__, "_pair_costs", noted)
+    monkeypatch.setitem(merge_pairs.__wrapped__.__globals__, "_pair_costs", noted)
     return seen
 
 

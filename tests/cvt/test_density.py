@@ -131,6 +131,8 @@ def test_shapes_that_do_not_fit_are_errors():
          "3), found torch.float32 of shape (4, 2)."),
         (lambda: embed(means, torch.zeros(5, 1, 3), frame=FRAME), "sh0 must be a tensor of floats "
          "of shape (4, 1, 3) or None, found torch.float32 of shape (5, 1, 3)."),
+        (lambda: embed(means, frame=FRAME, contraction=float("nan")), "contraction must be a "
+         "number from 0 to 1, found nan."),
         (lambda: embed(means, frame=2.0), "frame must be of type RobustFrame, found float."),
         (lambda: tessellation_weights(ones, ones[1:], area_power=1.0, floor=0.0), "areas must be a "
          "tensor of floats of shape (4,), found torch.float32 of shape (3,)."),

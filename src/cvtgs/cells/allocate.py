@@ -13,7 +13,9 @@ from torch import Tensor
 
 from cvtgs.analysis.effects import far_share
 from cvtgs.cells.moments import UPPER, Moments
+from cvtgs.checks import checked
 from cvtgs.config import AllocationConfig
+from cvtgs.counts import check_whole
 from cvtgs.devices import in_chunks
 from cvtgs.math.segments import label_argmin, take_columns
 
@@ -44,6 +46,7 @@ MOST_ROUNDS = 30  # number of vectorised rounds that choose disjoint pairs; capt
 ROW_BITS, LAST_ROW = 32, (1 << 32) - 1  # keys to sort by have a row number in their lower bits
 
 
+@checked
 def merge_pairs(
     groups: Moments, neighbors: Int[Tensor, "m k"], count: int, config: AllocationConfig
 ) -> Int[Tensor, "m"]:
@@ -63,7 +66,11 @@ def merge_pairs(
 
     Returns:
         The new group of every group, 0 to ``count - 1``.
+
+    Raises:
+        InvalidArgumentError: ``count`` is outside 1 to m, or shapes or types do not fit.
     """
+    check_whole(count, "count", most=len(groups.masses), things="groups")
     contrast = _relative_contrast(groups.colors, neighbors)
     far = float(far_share(torch.linalg.vector_norm(groups.means, dim=0), groups.apparent_masses))
     update = {
@@ -265,6 +272,7 @@ def _greedy_pass(
     return torch.tensor(taken, dtype=torch.int64, device=keys.device)
 
 
+@checked
 def reassign(
     members: Moments,
     labels: Int[Tensor, "n"],

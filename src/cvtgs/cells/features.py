@@ -14,6 +14,7 @@ from torch import Tensor
 from cvtgs.cells.descriptors import LEAST_PIXELS, PIXEL_SCALE, Descriptors
 from cvtgs.cells.inflate import project_on_axes, side_cover
 from cvtgs.cells.partition import Partition, SampledMembers, sample_members
+from cvtgs.checks import checked
 from cvtgs.math import parameters
 from cvtgs.math.segments import gather_columns, segment_ids, segment_max, segment_sum
 from cvtgs.math.spherical_harmonics import SH_C0
@@ -79,6 +80,7 @@ class CellTotals(NamedTuple):
     extents: Tensor
 
 
+@checked
 def describe_cells(
     scene: GaussianScene,
     merged: GaussianScene,

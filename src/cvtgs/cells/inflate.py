@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cells.partition import Partition
+from cvtgs.checks import checked
 from cvtgs.devices import chunk_length, in_threads
 from cvtgs.math import parameters
 from cvtgs.math.eigen import symmetric_eigen
@@ -27,6 +28,7 @@ FULL_COVER = 0.1
 CHUNK = 1 << 11  # cells per chunk of probing; each takes about ``1 kB`` per neighbour
 
 
+@checked
 def align_axes(
     merged: GaussianScene, partition: Partition, neighbors: Int[Tensor, "m k"]
 ) -> GaussianScene:
@@ -96,6 +98,7 @@ def _open_pairs(logs: Float[Tensor, "r 3"]) -> Float[Tensor, "r 3 3"]:
     return (groups[:, :, None] == groups[:, None]).double()
 
 
+@checked
 def inflate_cells(
     merged: GaussianScene,
     partition: Partition,

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.checks import checked
 from cvtgs.devices import HOST, in_chunks, move_together, one_thread
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.parameters import normalize_quats, quats_to_matrices
@@ -57,6 +58,7 @@ class Moments(NamedTuple):
     view_colors: Float[Tensor, "k n"]
 
 
+@checked
 def gaussian_moments(
     scene: GaussianScene,
     rows: Int[Tensor, "n"],
@@ -126,6 +128,7 @@ def mass_unit(masses: Float[Tensor, "n"], mean: Tensor | float) -> Float[Tensor,
     return torch.where(most > 0.0, most, torch.inf).clamp_max(mean)
 
 
+@checked
 def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Moments:
     """Return the moments of groups; the spread of means is computed about the mean of the group.
 
@@ -153,6 +156,7 @@ def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Mom
 
 
 @one_thread()
+@checked
 def view_components(
     scene: GaussianScene, rows: Int[Tensor, "n"], masses: Float[Tensor, "n"]
 ) -> Float[Tensor, "c k"]:

@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.checks import checked
+from cvtgs.counts import check_share
 from cvtgs.devices import row_chunks
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import SH_C0
@@ -38,12 +39,16 @@ def embed(
     Returns:
         Coordinates in robust radii, in the dtype of ``means``; d = 3, or 6 with colour.
 
+    Raises:
+        InvalidArgumentError: ``contraction`` is not from 0 to 1, or shapes or types do not fit.
+
     Example:
         >>> import torch
         >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=2.0)
         >>> embed(torch.ones(1, 3), frame=frame).tolist()
         [[0.5, 0.5, 0.5]]
     """
+    check_share(contraction, "contraction")
     colored = sh0 is not None and color > 0.0
     points = means.new_empty(len(means), 6 if colored else 3)
     for part in row_chunks(len(means), CHUNK, means.device):
