@@ -185,6 +185,24 @@ def test_far_members_and_huge_differences_stay_finite():
     assert float(found.members.abs().amax()) <= 50.0
 
 
+def test_coincident_members_of_a_tiny_cell_are_in_its_middle():
+    case = some_case()
+    point = {
+        "means": torch.zeros_like(case.merged.means),
+        "log_scales": case.merged.log_scales - 400,
+    }
+    scene = case.scene.with_tensors(means=torch.zeros_like(case.scene.means))
+    cells = torch.arange(len(case.part))
+    dtype = torch.float32
+    scene, merged = (
+        each.with_tensors({name: values.to(dtype) for name, values in each.tensors().items()})
+        for each in (scene, case.merged.with_tensors(point))
+    )
+    found = describe_published(scene, merged, case.part, cells=cells)
+    assert float(found.members[:, :3].abs().amax()) == 0.0
+    assert bool(found.members.isfinite().all())
+
+
 def test_saving_and_loading_keeps_the_kind(tmp_path):
     path, net = tmp_path / "net.safetensors", lively(torch.float32)
     path.write_bytes(save_checkpoint(net, INFO))

@@ -27,6 +27,8 @@ PUBLISHED_RESIDUALS = 3 + 3 + 3 + 1 + 3 * SH_COEFFICIENTS
 LARGEST_FEATURE = 50.0
 """Positions and differences of log scales are clamped to this, so that all values stay finite."""
 
+LARGEST_LOG = 80.0  # limit of a logarithm, whose exponential float32 holds
+
 
 class PublishedArchitecture(Record):
     """The architecture of a MergeNet as published; the publication does not give its widths.
@@ -94,7 +96,8 @@ def describe_published(
     axes = parameters.quats_to_matrices(own_quats)
     shifts = scene.means.index_select(0, rows) - merged.means.index_select(0, own)
     log_scales = merged.log_scales.index_select(0, own)
-    positions = torch.einsum("nji,nj->ni", axes, shifts) * torch.exp(-log_scales)
+    units = torch.exp((-log_scales).clamp_max(LARGEST_LOG))
+    positions = torch.einsum("nji,nj->ni", axes, shifts) * units
     quats = parameters.normalize_quats(scene.quats.index_select(0, rows))
     relative = parameters.multiply_quats(own_quats * own_quats.new_tensor([1, -1, -1, -1]), quats)
     relative = torch.where(relative[:, :1] < 0, -relative, relative)
