@@ -261,6 +261,24 @@ def test_share_of_duplicates(count, copies, dtype):
     assert found == pytest.approx(1 - 1 / copies, abs=1e-3)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("count", [8000, 200_000])
+@pytest.mark.parametrize("step", [1.0, 1 / 64, 1 / 4096])
+def test_duplicates_of_rounded_positions_are_found(step, count, dtype):
+    random = torch.Generator().manual_seed(0)
+    means = step * torch.randint(-30, 30, (count, 3), generator=random).to(dtype)
+    wanted = 1 - len(torch.unique(means, dim=0)) / count
+    error = 1e-9 if count == 8000 else 0.02  # estimated from a sample
+    assert float(duplicate_share(means, torch.zeros(count, 1, 3))) == pytest.approx(
+        wanted, abs=error
+    )
+
+
+def test_zeros_of_both_signs_are_one_position():
+    means = torch.tensor([[0.0, 1, 2], [-0.0, 1, 2]])
+    assert float(duplicate_share(means, torch.zeros(2, 1, 3))) == 0.5
+
+
 def test_duplicates_have_one_colour():
     scene = random_scene(50, degree=0)
     assert duplicate_share(scene.means * 0, scene.sh0) == 0.0

@@ -36,6 +36,8 @@ HASHED = 1 << 12  # smallest expected size of the sample in which duplicates are
 
 CHUNK = 1 << 14
 
+_FACTORS = (0x1E3779B97F4A7C15, 0x3F58476D1CE4E5B9, 0x14D049BB133111EB)  # odd, of 62 bits at most
+
 LEAST_CONTRAST = 1e-6  # floor of the contrast, for scenes of a single colour
 
 
@@ -293,11 +295,15 @@ def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) ->
 
 
 def _hash(means: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
-    """Hash positions; equal positions give equal hashes, which may be negative."""
+    """Hash positions; equal positions give equal hashes, which may be negative.
+
+    Rounded coordinates end with many zero bits, so upper bits must reach the lower ones.
+    """
     whole = torch.int32 if means.dtype == torch.float32 else torch.int64
-    x, y, z = means.contiguous().view(whole).unbind(1)
-    mixed = x * 73856093 + y * 19349663 + z * 83492791  # wraps round
-    return mixed ^ (mixed >> 13)
+    bits = (means + 0.0).contiguous().view(whole).long()  # no -0.0
+    x, y, z = (bits ^ (bits >> 32)).unbind(1)
+    mixed = x * _FACTORS[0] + y * _FACTORS[1] + z * _FACTORS[2]  # wraps round
+    return (mixed ^ (mixed >> 32)) * _FACTORS[0] >> 16
 
 
 def select_columns(scene: GaussianScene, choices: EffectsConfig) -> GaussianScene:
