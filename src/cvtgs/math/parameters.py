@@ -353,6 +353,9 @@ def mean_projected_area(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
 def log_mean_projected_area(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     """Return the logarithm of :func:`mean_projected_area`, for scales of any magnitude.
 
+    Only of needles is the ratio limited: the product of the largest two scales counts as at least
+    3e-24 of the square of the largest one, or 4e-192 in float64.
+
     Args:
         log_scales: Natural logarithms of the semi-axes.
 
