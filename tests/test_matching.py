@@ -279,13 +279,13 @@ def test_count_report_and_determinism(scene):
 @pytest.mark.slow
 def test_refinement_reuses_the_images_of_the_matching(scene, monkeypatch):
     """The full scene is rendered once for all steps; larger images are rendered anew."""
-    steps = {"size": 48, "stride": 2, "steps": 18, "steps_per_image": 20, "check_every": 3}
+    steps = {"size": 48, "stride": 2, "steps": 9, "steps_per_image": 20, "check_every": 3}
     images = {"views": 32, "size": 48, "stride": 2}
     config = preset(visibility=images, refine=steps)
     small, report = Simplifier(config=config, device="cpu").run(scene, 0.1)
     assert [cost.stage for cost in report.stages][-2:] == ["match", "refine"]
     refined = report.refinement
-    assert (refined.images, refined.heldout, refined.steps) == (0, 4, 18)
+    assert (refined.images, refined.heldout, refined.steps) == (0, 4, 9)
     assert refined.gain > 0
     assert same_bits(small, Simplifier(config=config, device="cpu").simplify(scene, 0.1))
     other = preset(visibility={"views": 16, "size": 64}, refine=steps)
