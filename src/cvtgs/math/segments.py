@@ -105,6 +105,7 @@ def label_argmin(
     values: Float[Tensor, "n"], labels: Int[Tensor, "n"], count: int
 ) -> Int[Tensor, "m"]:
     """Find the first row with the smallest value of each label; n for a label without rows."""
+    labels = labels.long()  # torch 2.4 scatters by no others
     least = values.new_full((count,), torch.inf).scatter_reduce(0, labels, values, "amin")
     rows = torch.arange(len(labels), device=labels.device)
     rows = torch.where(values == least.index_select(0, labels), rows, len(labels))
