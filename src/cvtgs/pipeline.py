@@ -72,7 +72,7 @@ class Reduced(NamedTuple):
     matching: MatchReport | None = None
 
 
-def reduce_scene(
+def reduce_scene(  # noqa: PLR0913 (options by name)
     scene: GaussianScene,
     analysis: SceneAnalysis,
     target: int,
@@ -82,6 +82,7 @@ def reduce_scene(
     clock: StageClock,
     total: int = 0,
     ordered: OrderedRows | None = None,
+    importance: Float[Tensor, "n"] | None = None,
 ) -> Reduced:
     """Run the stages after the analysis: filter, weigh, tessellate, allocate, merge, correct.
 
@@ -94,6 +95,7 @@ def reduce_scene(
         clock: Measures each stage.
         total: Number of Gaussians before invalid rows were dropped.
         ordered: Result of :func:`cvtgs.grouping.order_rows` for the scene; None computes it.
+        importance: Factors on the apparent masses in the costs of merging; None for none.
 
     Returns:
         The small scene, with its cells. If all Gaussians are kept, they have finite opacities, and
@@ -106,7 +108,7 @@ def reduce_scene(
         rows, left_out, left_out_mass_share = filter_rows(used, analysis, target, config.filter)
     with clock.stage("weigh"):
         points = weigh_rows(used, rows, analysis, config, ordered=ordered)
-        points = with_importance(points, analysis.importance)
+        points = with_importance(points, importance)
     del rows  # frees memory
     with clock.stage("tessellate", config.cvt.iterations + 1) as advance:
         tessellation = tessellate_rows(points, analysis, target, config, on_iteration=advance)

@@ -1,7 +1,6 @@
 """Prepared: a scene to simplify repeatedly, with a fallback if the device lacks memory."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
@@ -290,7 +289,7 @@ class Prepared:
                 count=len(valid),
                 power=power,
             )
-        return reduce(replace(analysis, importance=importance))
+        return reduce(analysis, importance=importance)
 
     def _order(
         self, valid: GaussianScene, analysis: SceneAnalysis, target: int, clock: StageClock

@@ -54,7 +54,6 @@ class SceneAnalysis:
         plan: The effects that the scene calls for.
         observed: Images of the scene and the contributions of these Gaussians to them; None if
             later stages do not use them.
-        importance: ``(n,)`` factors on apparent masses in the costs of merging; None for none.
     """
 
     frame: RobustFrame
@@ -65,7 +64,6 @@ class SceneAnalysis:
     visibility: Float[Tensor, "n_or_0"]
     plan: EffectPlan
     observed: ObservedViews | None = None
-    importance: Float[Tensor, "n"] | None = None
 
     def select(self, rows: Tensor) -> Self:
         """Return the analysis of some Gaussians.
@@ -86,7 +84,6 @@ class SceneAnalysis:
             areas=self.areas[rows],
             apparent_areas=self.apparent_areas[rows],
             visibility=self.visibility[rows] if len(self.visibility) else self.visibility,
-            importance=None if self.importance is None else self.importance[rows],
         )
 
 
