@@ -77,7 +77,7 @@ def test_levels_and_repeated_runs_have_the_bits_of_single_runs():
     assert same(levels[1].scene, wanted)
 
 
-def test_protected_gaussians_stay_and_hide_the_errors_behind_them():
+def test_protected_gaussians_stay_and_come_first():
     keep = torch.zeros(len(full()), dtype=torch.bool)
     keep[::20] = True
     found = matched(1.0).simplify(full(), count=COUNT, cameras=given_cameras(), keep=keep)
