@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 import cvtgs
@@ -58,3 +59,18 @@ def test_wrong_arguments_of_a_stream_are_named(source, name, value, message):
         stream_file(source, source.with_name("out"), [1.0, 0.1], kind="sog", **more)
     assert str(caught.value).startswith(message)
     assert list(source.parent.iterdir()) == [source]
+
+
+def test_numbers_may_be_of_numpy(source):
+    numbers = {"blocks": 2, "memory": 10**9, "sh_degree": 0, "range_rows": 100}
+    for name, change in {"own": int, "numpy": np.int64}.items():
+        more = {key: change(number) for key, number in numbers.items()}
+        simplify_file(source, source.with_name(f"{name}.ply"), 0.1, **more)
+    assert source.with_name("numpy.ply").read_bytes() == source.with_name("own.ply").read_bytes()
+
+
+def test_ratios_of_a_stream_may_come_one_by_one(source):
+    report = stream_file(source, source.with_name("out"), iter([1.0, 0.1]), kind="sog", blocks=2)
+    assert [level.gaussians for level in report.levels] == [300, 30]
+    with pytest.raises(InvalidArgumentError, match=r"ratios must be a list of numbers, found 0.5"):
+        stream_file(source, source.with_name("other"), 0.5, kind="sog", blocks=2)

@@ -15,7 +15,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.checks import checked
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
-from cvtgs.counts import check_whole, shared_out, shortfall, target_count
+from cvtgs.counts import check_whole, shared_out, shortfall, target_count, whole_number
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
 from cvtgs.errors import ConfigError, DroppedDataWarning, warn
 from cvtgs.evaluation.scorer import check_seen
@@ -143,8 +143,10 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     rows = open_rows(source, sh_degree=sh_degree, axes=source_axes)
     target = target_count(rows.count, rho, count=count, max_count=max_count)
     check_memory(memory, with_images=simplifier.config.uses_images)
-    if range_rows is not None:
-        check_whole(range_rows, "range_rows")
+    if range_rows is None:
+        range_rows = rows_per_range(rows.count)
+    check_whole(range_rows, "range_rows")
+    memory = None if memory is None else whole_number(memory)
     room = memory or memory_to_plan()
     if simplifier.config.uses_images:
         room -= IMAGE_BYTES
@@ -162,7 +164,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         boxes=tuple(listed(boxes, Box, required="boxes must be of type Box")),
         config=simplifier.config,
         has_network=simplifier.checkpoint is not None,
-        range_rows=rows_per_range(rows.count) if range_rows is None else range_rows,
+        range_rows=whole_number(range_rows),
         sample_rows=sample_rows(room),
         cell_room=cell_room(memory),
         axes=checked_axes(output_axes or SCENE_AXES) if is_plain_ply(output) else SCENE_AXES,

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cvtgs.counts import whole_number
 from cvtgs.errors import (
     DroppedDataWarning,
     FileFormatError,
@@ -360,6 +361,6 @@ def open_rows(
         layout=layout_of(vertex),
         comments=header.comments,
         offset=header.data_offset,
-        sh_degree=sh_degree,
+        sh_degree=None if sh_degree is None else whole_number(sh_degree),
         axes=SCENE_AXES if axes is None else checked_axes(axes),
     )
