@@ -77,6 +77,21 @@ def test_shares_of_errors_are_weighted_like_the_colours_of_an_image(backend):
         error_shares(scene, cameras)
 
 
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_errors_are_shared_out_in_modes_without_gradients(backend, mode):
+    def shares():
+        scene = random_scene(20)
+        cameras = automatic_views(scene, 1, width=16, height=16)
+        return error_shares(scene[:9], observe(scene, cameras, backend=backend), backend=backend)
+
+    wanted = shares()
+    with mode():
+        found = shares()
+    assert torch.equal(found, wanted)
+    assert float(found.sum()) > 0.0
+
+
 def test_hidden_gaussians_contribute_nothing():
     """Nothing behind an opaque wall contributes, however opaque."""
     shield = [[x / 4, y / 4, -1.0] for x in range(-4, 5) for y in range(-4, 5)]

@@ -15,7 +15,12 @@ from cvtgs.errors import InvalidArgumentError, memory_errors
 from cvtgs.math import parameters
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.rendering.backends import BackendName, BlendingWeights, choose_backend
+from cvtgs.rendering.backends import (
+    BackendName,
+    BlendingWeights,
+    choose_backend,
+    without_gradients,
+)
 from cvtgs.scene import GaussianScene, SceneLike, as_scene, check_scene
 from cvtgs.text import shown
 
@@ -298,10 +303,11 @@ def error_shares(
     check_scene(scene)
     check_observed(views, "views")
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
+    constant = without_gradients(scene)
     for camera, wanted in zip(views.cameras.singles(), views.rgb, strict=True):
-        colors = scene.sh0.detach().clone()
-        with torch.enable_grad():
-            drawn = scene.with_tensors(sh0=colors.requires_grad_())
+        with torch.inference_mode(mode=False), torch.enable_grad():
+            colors = constant.sh0.clone().requires_grad_()
+            drawn = constant.with_tensors(sh0=colors)
             image = render(drawn, camera, backend=backend).rgb[0]
             differences = image.detach().clamp(0, 1) - wanted.to(image).clamp(0, 1)
             squares = differences.square().sum(dim=2, keepdim=True)
