@@ -333,24 +333,24 @@ SceneLike = GaussianScene | str | os.PathLike[str]
 """A scene, or the path of its file or folder."""
 
 
-def check_scene(scene: object) -> None:
-    """Raise unless a value is a scene."""
+def check_scene(scene: object, name: str = "scene") -> None:
+    """Raise unless a value is a scene that holds values."""
     if not isinstance(scene, GaussianScene):
-        raise InvalidArgumentError(f"scene must be a GaussianScene, found {shown(scene)}.")
+        raise InvalidArgumentError(f"{name} must be a GaussianScene, found {shown(scene)}.")
+    if scene.device.type == "meta":
+        raise InvalidSceneError(f"{name} must hold values, found tensors on the device meta.")
 
 
 def as_scene(scene: SceneLike, name: str = "scene") -> GaussianScene:
     """Return a scene unchanged, or read it from a path; raise for anything else."""
-    if isinstance(scene, GaussianScene):
-        if scene.device.type == "meta":
-            raise InvalidSceneError(f"{name} must hold values, found tensors on the device meta.")
-        return scene
-    if isinstance(scene, str | os.PathLike):
-        read: GaussianScene = resolve_name("cvtgs.io.formats:load")(scene)
-        return read
-    raise InvalidArgumentError(
-        f"{name} must be a GaussianScene or the path of one, found {type(scene).__name__}."
-    )
+    is_path = isinstance(scene, str | os.PathLike)
+    found = resolve_name("cvtgs.io.formats:load")(scene) if is_path else scene
+    if not isinstance(found, GaussianScene):
+        raise InvalidArgumentError(
+            f"{name} must be a GaussianScene or the path of one, found {type(scene).__name__}."
+        )
+    check_scene(found, name)
+    return found
 
 
 def checked_scenes(scenes: Any, work: str) -> list[GaussianScene]:

@@ -1,6 +1,7 @@
 """The output of a simplification, its report, and arguments that are refused."""
 
 import math
+from io import BytesIO
 
 import pytest
 import torch
@@ -168,6 +169,10 @@ def test_devices_that_do_not_exist_are_errors(device):
         cvtgs.describe,
         lambda scene: cvtgs.render(scene, ring(2)),
         lambda scene: cvtgs.evaluate(scene, {"same": scene}, ring(2)),
+        lambda scene: cvtgs.rendering.observe(scene, ring(2)),
+        lambda scene: cvtgs.rendering.contributions(scene, ring(2)),
+        lambda scene: cvtgs.save(scene, BytesIO(), format="spz"),
+        lambda scene: cvtgs.io.losses(scene, ".spz"),
     ],
 )
 def test_a_scene_without_values_is_an_error(call):
