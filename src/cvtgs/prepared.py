@@ -303,7 +303,8 @@ class Prepared:
 
     def _match(self, reduced: Reduced, analysis: SceneAnalysis, clock: StageClock) -> Reduced:
         """Match the small scene to the images of the analysis, if there are any."""
-        if reduced.partition is None or analysis.observed is None:
+        is_off = not self._config.match.enabled
+        if is_off or reduced.partition is None or analysis.observed is None:
             return reduced
         from cvtgs.matching import cell_contributions, match_views  # noqa: PLC0415 (few need it)
 

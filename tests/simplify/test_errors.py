@@ -29,9 +29,9 @@ def given_cameras() -> Cameras:
     return automatic_views(full(), 6, width=64, height=64)
 
 
-def matched(power: float, **steps: int) -> Simplifier:
+def matched(power: float, *, rounds: int = 1, **steps: int) -> Simplifier:
     settings = {
-        "match": {"error_power": power},
+        "match": {"error_power": power, "opacity_rounds": rounds},
         "visibility": {"views": 8, "size": 64, "stride": 1},
         "refine": {"steps": 0, "size": 64, "stride": 1} | steps,
     }
@@ -51,6 +51,16 @@ def test_cells_merge_less_where_the_given_cameras_see_errors():
     views = observe(full(), given_cameras())
     errors = [mean_squared_error(result.scene, views) for result in (once, twice)]
     assert errors[1] < 0.95 * errors[0]
+
+
+def test_errors_count_without_a_match_of_opacities():
+    once, twice = (
+        matched(power, rounds=0).run(full(), count=COUNT, cameras=given_cameras())
+        for power in (0.0, 1.0)
+    )
+    assert not same(once.scene, twice.scene)
+    assert twice.report.matching is None
+    assert twice.report.stages[-1].stage == "errors"
 
 
 def test_errors_in_generated_views_do_not_count():

@@ -271,7 +271,7 @@ def measure_visibility(
     """Correct apparent areas, and the haze effect, by the contributions to images of the scene."""
     used, observed = drop_unused_bands(scene, analysis.plan), None
     views = visibility_cameras(used, config, cameras=cameras)
-    if config.match.enabled:
+    if config.match.enabled or (cameras is not None and config.match.error_power > 0.0):
         observed = observe(used, views)
         rendered = observed.contributions
     else:
