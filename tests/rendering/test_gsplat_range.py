@@ -1,4 +1,4 @@
-"""The gsplat backend, with a stand-in for gsplat: dtypes, distances and large sets of images."""
+"""The gsplat backend, with a stand-in for gsplat: dtypes, distances, many images, and errors."""
 
 import sys
 from dataclasses import replace
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import gsplat_stand_in
-from cvtgs.rendering import gsplat_backend, torch_backend
+from cvtgs.rendering import error_shares, gsplat_backend, observe, torch_backend
 from render_cases import around
 from scenes import random_scene
 
@@ -74,3 +74,16 @@ def default_dtype(request):
 @pytest.mark.usefixtures("default_dtype")
 def test_the_probe_does_not_depend_on_the_default_dtype():
     assert gsplat_backend._failure("cpu") == ""
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_errors_are_shared_out_as_by_torch(monkeypatch, mode):
+    monkeypatch.setattr(gsplat_backend, "require", lambda device: None)
+    scene = random_scene(20, degree=1, seed=5)
+    views = observe(scene, around(3), backend="torch")
+    with mode():
+        found = error_shares(scene[:9], views, backend="gsplat")
+        none = error_shares(scene[:0], views, backend="gsplat")
+    wanted = error_shares(scene[:9], views, backend="torch")
+    torch.testing.assert_close(found.clone(), wanted, rtol=1e-3, atol=1e-2)
+    assert len(none) == 0

@@ -309,6 +309,8 @@ def error_shares(
             colors = constant.sh0.clone().requires_grad_()
             drawn = constant.with_tensors(sh0=colors)
             image = render(drawn, camera, backend=backend).rgb[0]
+            if not image.requires_grad:  # an empty one of gsplat
+                continue
             differences = image.detach().clamp(0, 1) - wanted.to(image).clamp(0, 1)
             squares = differences.square().sum(dim=2, keepdim=True)
             (found,) = torch.autograd.grad((image * squares).sum(), colors)
