@@ -157,3 +157,25 @@ def test_levels_need_a_folder_to_write_to(tmp_path, capsys):
     save(random_scene(30), tmp_path / "a.ply")
     assert main(["levels", str(tmp_path / "a.ply"), "-o", str(tmp_path / "a.ply")]) == 1
     assert "a.ply: must be a folder or a new path, found: file exists" in capsys.readouterr().err
+
+
+def test_a_level_does_not_replace_its_scene(tmp_path, capsys):
+    path = tmp_path / "rho_0.5.ply"
+    save(random_scene(30), path)
+    line = ["levels", str(path), "-o", str(tmp_path), "--rho", "0.5", "--overwrite"]
+    assert main(line) == 1
+    assert "rho_0.5.ply: a level must not replace the scene; choose another" in (
+        capsys.readouterr().err
+    )
+    assert len(load(path)) == 30
+    assert [one.name for one in tmp_path.iterdir()] == ["rho_0.5.ply"]
+
+
+def test_a_page_shows_a_scene_that_is_named_like_a_level(tmp_path, monkeypatch):
+    path, shown = tmp_path / "rho_0.5.ply", {}
+    save(random_scene(30), path)
+    monkeypatch.setattr("cvtgs.cli.levels.check_page", lambda options: None)
+    monkeypatch.setattr("cvtgs.cli.levels.write_page", lambda options, scenes: shown.update(scenes))
+    line = ["levels", str(path), "-o", str(tmp_path / "out"), "--rho", "0.5", "--no-scores"]
+    assert main([*line, "--viewer"]) == 0
+    assert {name: len(one) for name, one in shown.items()} == {str(path): 30, "rho_0.5.ply": 15}

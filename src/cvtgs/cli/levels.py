@@ -1,7 +1,7 @@
 """``cvtgs levels``: several sizes of one scene, and an index for viewers."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import cvtgs
@@ -18,6 +18,7 @@ from cvtgs.cli.options import (
     add_options,
     checkpoint_of,
     dotted,
+    is_same_file,
     preset_of,
     ratios,
     read_axes,
@@ -25,6 +26,7 @@ from cvtgs.cli.options import (
 )
 from cvtgs.cli.streams import add_stream_options, check_stream_options, stream_blocks, stream_levels
 from cvtgs.cli.view import check_page, write_page
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.text import printable, size_text
 
 if TYPE_CHECKING:
@@ -87,6 +89,7 @@ def levels(options: argparse.Namespace) -> None:
     check_stream_options(options)
     check_page(options)
     if options.stream is None:
+        _check_input(options, names)
         cvtgs.levels.check_levels(options.output, names, overwrite=options.overwrite)
     config = cvtgs.SimplifyConfig.compose(
         file=options.config, preset=preset_of(options), settings=read_settings(options.settings)
@@ -134,7 +137,19 @@ def levels(options: argparse.Namespace) -> None:
             listed = ", ".join(map(printable, sorted(older)))
             say_wrapped(f"Not in {cvtgs.levels.INDEX_NAME}, of an earlier run: {listed}.")
     small = {name: level.scene for name, level in zip(names, made, strict=True)}
-    write_page(options, {options.input.name: scene, **small})
+    title = str(options.input) if options.input.name in small else options.input.name
+    write_page(options, {title: scene, **small})
+
+
+def _check_input(options: argparse.Namespace, names: Sequence[str]) -> None:
+    """Raise if a level would replace the scene, whose name nobody gave as an output."""
+    file = cvtgs.io.scene_file(options.input)
+    for name in names:
+        if is_same_file(options.output / name, file):
+            raise InvalidArgumentError(
+                f"{options.output / name}: a level must not replace the scene; choose another "
+                f"folder."
+            )
 
 
 def _score(
