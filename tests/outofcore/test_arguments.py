@@ -61,6 +61,17 @@ def test_wrong_arguments_of_a_stream_are_named(source, name, value, message):
     assert list(source.parent.iterdir()) == [source]
 
 
+@pytest.mark.parametrize("axes", [None, 5, "rdf", ("rdf",)])
+def test_axes_of_a_stream_are_two(source, axes):
+    with pytest.raises(InvalidArgumentError, match="axes must be those of the input file and tho"):
+        stream_file(source, source.with_name("out"), [1.0, 0.1], kind="sog", axes=axes)
+
+
+def test_the_source_is_a_path(source):
+    with pytest.raises(InvalidArgumentError, match="a path must be a str or Path, found NoneType"):
+        simplify_file(None, source.with_name("out.ply"), 0.1)
+
+
 def test_numbers_may_be_of_numpy(source):
     numbers = {"blocks": 2, "memory": 10**9, "sh_degree": 0, "range_rows": 100}
     for name, change in {"own": int, "numpy": np.int64}.items():

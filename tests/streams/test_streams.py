@@ -287,6 +287,7 @@ def test_arguments_of_other_types_are_refused(plan: StreamPlan, tmp_path: Path, 
     for words, options, text in (
         ((3, tmp_path), {}, "plan must be of type StreamPlan, found int"),
         ((plan, 3), {}, "a path must be a str or Path, found int"),
+        ((plan, tmp_path), {"listener": None}, "listener must be a function of a progress event"),
         ((plan, tmp_path), {most: "9"}, f"{most} must be a whole number above 0, found '9'"),
     ):
         with pytest.raises(InvalidArgumentError, match=text):

@@ -17,7 +17,7 @@ from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import check_whole, shared_out, shortfall, target_count, whole_number
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
-from cvtgs.errors import ConfigError, DroppedDataWarning, warn
+from cvtgs.errors import ConfigError, DroppedDataWarning, check_path, warn
 from cvtgs.evaluation.scorer import check_seen
 from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output, check_save, load, save
@@ -140,6 +140,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     check_config(simplifier.config)
     check_cameras(cameras, simplifier.config)
     check_save(output, overwrite=overwrite)
+    check_path(source)
     rows = open_rows(source, sh_degree=sh_degree, axes=source_axes)
     target = target_count(rows.count, rho, count=count, max_count=max_count)
     check_memory(memory, with_images=simplifier.config.uses_images)

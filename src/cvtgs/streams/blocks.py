@@ -274,7 +274,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
 
 
 def _check_axes(axes: tuple[str, str]) -> None:
-    if isinstance(axes, str) or len(axes) != 2:
+    if not isinstance(axes, tuple | list) or len(axes) != 2:
         raise InvalidArgumentError(
             f"axes must be those of the input file and those of the output, found {shown(axes)}."
         )

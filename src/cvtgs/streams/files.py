@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import pydantic
 
 from cvtgs.boxes import Corner
+from cvtgs.clock import check_listener
 from cvtgs.config.base import Record
 from cvtgs.errors import (
     DroppedDataWarning,
@@ -115,6 +116,7 @@ def write_stream(
 ) -> tuple[StreamLevel, ...]:
     """Write a stream of one part; either all files are written or none."""
     check_stream(folder, form.kind, overwrite=overwrite)
+    check_listener(listener)
     place = Path(folder)
     hidden = hidden_path(place, "stream")
     shutil.rmtree(hidden, ignore_errors=True)
