@@ -10,6 +10,7 @@ from cvtgs import Simplifier, SimplifyConfig, load, save
 from cvtgs.edit import merge
 from cvtgs.errors import DroppedDataWarning
 from cvtgs.scene import FLAT_LOG_SCALE
+from cvtgs.streams import plan_stream, write_sog_stream, write_tiles
 from cvtgs.tags import TWO_SCALES
 from hard_cases import flat_file
 from scenes import random_scene
@@ -31,6 +32,16 @@ def test_merged_gaussians_of_any_format_are_flat(tmp_path: Path, suffix: str) ->
 def test_formats_without_the_tag_warn(tmp_path: Path, suffix: str) -> None:
     with pytest.warns(DroppedDataWarning, match="the tag 'SplatRenderMode: 2dgs', without which"):
         save(flat_file(300, torch.float32), tmp_path / f"flat{suffix}")
+
+
+@pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
+def test_streams_of_flat_gaussians_have_the_tag(tmp_path: Path) -> None:
+    levels = Simplifier(device="cpu").levels(flat_file(300, torch.float32), [0.5, 0.1])
+    write_tiles(plan_stream(levels), tmp_path / "tiles")
+    write_sog_stream(plan_stream(levels), tmp_path / "sog")
+    tiles = sorted((tmp_path / "tiles").glob("*.glb"))
+    assert len(tiles) == 2
+    assert all(load(path).has_two_scales for path in [*tiles, tmp_path / "sog"])
 
 
 def test_thick_gaussians_have_no_tag() -> None:

@@ -252,8 +252,7 @@ def save(
         check_output(path, overwrite)
     axes = _FILE_AXES.get(suffix, SCENE_AXES) if axes is None else axes
     scene = change_axes(scene, SCENE_AXES, axes)
-    if suffix != ".ply" and scene.has_two_scales and not TWO_SCALES.is_in(scene.comments):
-        scene = replace(scene, comments=(*scene.comments, TWO_SCALES.text))  # not by a layout
+    scene = scene if suffix == ".ply" else tagged_if_flat(scene)
     dropped = losses(scene, named).dropped
     if dropped:
         warn(f"{name}: files of this format do not hold {'; '.join(dropped)}.", DroppedDataWarning)
@@ -261,6 +260,13 @@ def save(
     write: Callable[..., None] = resolve_name(_WRITERS[suffix])
     with output as file:
         write(scene, file, **options)
+
+
+def tagged_if_flat(scene: GaussianScene) -> GaussianScene:
+    """Return a scene of two scales with their tag, for formats that keep no layout."""
+    if not scene.has_two_scales or TWO_SCALES.is_in(scene.comments):
+        return scene
+    return replace(scene, comments=(*scene.comments, TWO_SCALES.text))
 
 
 def losses(scene: GaussianScene, path: str | os.PathLike[str]) -> Losses:

@@ -17,6 +17,7 @@ from cvtgs.devices import on_host
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io import atomic_output
 from cvtgs.io.axes import SCENE_AXES, change_axes
+from cvtgs.io.formats import tagged_if_flat
 from cvtgs.io.gltf import write_spz_glb
 from cvtgs.io.gltf.document import AXES, SPLATS, SPZ
 from cvtgs.io.limits import FORMAT_LIMITS, dropped_within
@@ -75,7 +76,8 @@ class TilesFormat:
         for number, tile in enumerate(tiles):
             scene = plan.levels[tile.level].scene
             rows = torch.cat([plan.chunks[chunk].rows[tile.level] for chunk in tile.chunks])
-            turned = change_axes(scene.select(rows.to(scene.device)), SCENE_AXES, AXES)
+            some = tagged_if_flat(scene.select(rows.to(scene.device)))
+            turned = change_axes(some, SCENE_AXES, AXES)
             path = folder / names[id(tile)]
             with atomic_output(path, overwrite=True) as file:
                 write_spz_glb(turned, file)
