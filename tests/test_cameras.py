@@ -180,6 +180,14 @@ def test_wrong_positions(eyes, targets, text):
     assert text in str(caught.value)
 
 
+def test_cameras_may_share_a_target_and_up_may_be_of_whole_numbers():
+    eyes, target = torch.randn(3, 3), torch.tensor([[0.0, 0.0, 9.0]])
+    wanted = look_at(eyes, target.expand(3, 3), torch.tensor([0.0, -1.0, 0.0]))
+    assert torch.equal(look_at(eyes, target, torch.tensor([0, -1, 0])), wanted)
+    with pytest.raises(InvalidArgumentError, match=r"of shape \(3, 3\) or .*, found .*\(2, 3\)"):
+        look_at(eyes, torch.zeros(2, 3), torch.tensor([0, -1, 0]))
+
+
 def test_positions_may_have_several_dtypes():
     eyes, targets = torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 5.0]], dtype=torch.float64)
     found = look_at(eyes, targets, torch.tensor([0.0, -1.0, 0.0]))

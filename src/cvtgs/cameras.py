@@ -54,10 +54,8 @@ class Cameras:
     ignores_tag: tuple[bool, ...] = ()
 
     def __post_init__(self) -> None:
-        check_kinds(
-            {"viewmats": Float[Tensor, "c 4 4"], "Ks": Float[Tensor, "c 3 3"]},
-            {"viewmats": self.viewmats, "Ks": self.Ks},
-        )
+        kinds = {"viewmats": Float[Tensor, "c 4 4"], "Ks": Float[Tensor, "c 3 3"]}
+        check_kinds(kinds, {"viewmats": self.viewmats, "Ks": self.Ks})
         count = len(self.viewmats)
         if self.viewmats.device != self.Ks.device or self.viewmats.dtype != self.Ks.dtype:
             raise InvalidArgumentError(
@@ -353,13 +351,15 @@ def view_scales(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "c"]:
 @without_autocast()
 @checked
 def look_at(
-    eyes: Float[Tensor, "c 3"], targets: Float[Tensor, "c 3"], up: Float[Tensor, "3"]
+    eyes: Float[Tensor, "c 3"],
+    targets: Float[Tensor, "c 3"] | Float[Tensor, "1 3"],
+    up: Float[Tensor, "3"] | Int[Tensor, "3"],
 ) -> Float[Tensor, "c 4 4"]:
     """Build view matrices of cameras that look at points.
 
     Args:
         eyes: Positions of the cameras.
-        targets: Point in the middle of each image; must differ from the position of the camera.
+        targets: Point in the middle of each image, or one for all; none may be at its camera.
         up: Direction that is up in the images, of any length but 0.
 
     Returns:
