@@ -12,6 +12,7 @@ import torch
 
 from cvtgs import GaussianScene, Simplifier, concatenate, load, save
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
+from cvtgs.io.atomic import replace_file
 from cvtgs.outofcore import LocalWorkers
 from cvtgs.streams import plan_stream, stream_file, write_sog_stream
 from cvtgs.synthetic import scene as make
@@ -283,6 +284,26 @@ def test_blocks_share_one_environment(tmp_path: Path, monkeypatch: pytest.Monkey
     assert 2500 < report.levels[0].gaussians <= 3000
     assert len(load(tmp_path / "out")) == 3200
     assert sorted(path.name for path in (tmp_path / "out").glob("[.e]*")) == ["environment"]
+
+
+def test_blocks_are_kept_if_the_last_step_is_interrupted(
+    tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, moved = tmp_path / "out", []
+    out.mkdir()
+
+    def move(path: Path, target: Path) -> None:
+        moved.append(target)
+        if len(moved) == 3:
+            raise StoppedError
+        replace_file(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("cvtgs.streams.files.replace_file", move)
+        with pytest.raises(StoppedError):
+            stream(source, out)
+    assert names_in(out) == []
+    assert stream(source, out).resumed_blocks == 3
 
 
 @pytest.mark.parametrize("blocks", [None, 3])

@@ -225,9 +225,10 @@ def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
         for name in old:  # left over from the replaced stream
             _remove(place / name)
     except BaseException as error:
-        for name in names if is_new else ():
+        written = [name for name in [index, *names] if (place / name).exists()]
+        for name in written if is_new else ():
             with suppress(OSError):
-                _remove(place / name)
+                replace_file(place / name, hidden / name)  # a resumed run needs it there
         if isinstance(error, OSError):
             raise _refused(place, error) from error
         raise
