@@ -1,11 +1,11 @@
-"""The output of processes as Windows writes it: other line ends, another encoding."""
+"""Processes of a tradeoff: their start, and their output as Windows writes it."""
 
 import sys
 
 import pytest
 
 from cvtgs.errors import RunError
-from cvtgs.tradeoff.measure import run_process
+from cvtgs.tradeoff.measure import START, run_process
 
 
 def test_the_output_of_a_process_on_windows_is_read(monkeypatch):
@@ -14,3 +14,9 @@ def test_the_output_of_a_process_on_windows_is_read(monkeypatch):
     assert run_process([sys.executable, "-c", code]).output == "K\xfcche\n"
     with pytest.raises(RunError, match=r"^K\xfcche is missing$"):
         run_process([sys.executable, "-c", "import sys; sys.exit('K\\xfcche is missing')"])
+
+
+def test_the_start_of_a_run_is_measured_as_the_command_line_starts(monkeypatch):
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    shown = "import os; print(os.environ.get('OMP_WAIT_POLICY'), gc.get_freeze_count() > 0)"
+    assert run_process([sys.executable, "-c", START + shown]).output == "PASSIVE True\n"

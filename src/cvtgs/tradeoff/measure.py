@@ -33,8 +33,13 @@ from cvtgs.views import automatic_views, find_own_cameras
 
 WARNING = "cvtgs: warning: "
 
-START = "import cvtgs.cli.main, cvtgs.config, cvtgs.io, cvtgs.mergenet, cvtgs.simplifier"
-"""Imports of every process before it reads a scene."""
+START = """
+import gc, cvtgs.cli.main, cvtgs.startup
+cvtgs.startup.load_torch()
+import cvtgs.config, cvtgs.io, cvtgs.mergenet, cvtgs.simplifier
+gc.freeze()
+"""
+"""What every process does besides work on a scene: it loads modules as the command line does."""
 
 # A process inherits the peak memory of its parent, so this small launcher starts the command. On an
 # interrupt, which the child receives too, it keeps waiting for the child. When its own parent ends
