@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import cvtgs
 from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped
 from cvtgs.cli.options import AddParser, add_options, count
+from cvtgs.cli.paths import new_folder
 from cvtgs.errors import OutputExistsError
 from cvtgs.text import size_text
 
@@ -34,7 +35,7 @@ def add_demo(add_parser: AddParser) -> None:
     parser.add_argument(
         "-o",
         "--output",
-        type=Path,
+        type=new_folder,
         default=Path("cvtgs-demo"),
         metavar="DIR",
         help="directory to write to (default cvtgs-demo); the files of an earlier demo are "

@@ -5,7 +5,6 @@ import math
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cvtgs
@@ -28,6 +27,7 @@ from cvtgs.cli.options import (
     read_scene,
     read_settings,
 )
+from cvtgs.cli.paths import any_path
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
 from cvtgs.tags import described_tags
 from cvtgs.text import counted, printable, size_text
@@ -56,7 +56,7 @@ def add_edit_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--merge",
         metavar="FILE",
-        type=Path,
+        type=any_path,
         action="append",
         default=[],
         help="scene to add to IN, in any format; can be repeated",

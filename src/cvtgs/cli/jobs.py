@@ -19,6 +19,7 @@ from cvtgs.cli.display import (
     send_file,
 )
 from cvtgs.cli.options import READABLE, WRITABLE, CommandParser, dotted, is_same_file
+from cvtgs.cli.paths import new_folder
 from cvtgs.errors import (
     CvtgsError,
     InputError,
@@ -75,7 +76,7 @@ def add_paths(parser: CommandParser, *, options: str) -> None:
         "-o",
         "--output",
         dest="folder",
-        type=Path,
+        type=new_folder,
         metavar="DIR",
         help="directory to write to; each scene keeps its name",
     )
@@ -90,6 +91,8 @@ def add_paths(parser: CommandParser, *, options: str) -> None:
 
 def check_paths(parser: CommandParser, options: argparse.Namespace) -> None:
     """Exit with a usage error if the paths do not match the use of -o and --suffix."""
+    if "" in options.paths:
+        parser.error("IN and OUT must be paths, found ''")
     if options.folder is None and len(options.paths) != 2:
         found = f"{counted(len(options.paths), 'path')} ({shortened(', '.join(options.paths), 60)})"
         parser.error(

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import cvtgs
 from cvtgs.cli.display import say
+from cvtgs.cli.paths import any_path, new_folder
 from cvtgs.errors import ConfigError, InvalidArgumentError
 from cvtgs.text import suggestion
 
@@ -75,22 +76,15 @@ def _usage_errors() -> Iterator[None]:
         raise argparse.ArgumentTypeError(str(error).rstrip(".")) from error
 
 
-def file(text: str) -> Path:
-    """Read the path of a file to write, for argparse."""
-    if text.endswith(("/", os.sep)):
-        raise argparse.ArgumentTypeError(f"must be a file, found the folder {text!r}")
-    return Path(text)
-
-
 # Keys are option names, with both spellings where there are two. Help texts of values are noun
 # phrases; those of flags begin with a verb.
 _SHARED: Mapping[str, Mapping[str, Any]] = {
-    "input": {"metavar": "IN", "type": Path, "help": f"scene to read ({READABLE})"},
-    "reference": {"metavar": "REF", "type": Path, "help": f"full scene ({READABLE})"},
-    "small": {"metavar": "SMALL", "type": Path, "nargs": "+", "help": "simplified scenes"},
+    "input": {"metavar": "IN", "type": any_path, "help": f"scene to read ({READABLE})"},
+    "reference": {"metavar": "REF", "type": any_path, "help": f"full scene ({READABLE})"},
+    "small": {"metavar": "SMALL", "type": any_path, "nargs": "+", "help": "simplified scenes"},
     "-o/--output": {
         "metavar": "DIR",
-        "type": Path,
+        "type": new_folder,
         "required": True,
         "help": "directory to write to",
     },
@@ -107,7 +101,7 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
         "help": "MergeNet checkpoint: auto (default: that of the preset), standard, paper, a "
         "file, or none to merge by moments alone",
     },
-    "--config": {"metavar": "F.toml", "type": Path, "help": "configuration file"},
+    "--config": {"metavar": "F.toml", "type": any_path, "help": "configuration file"},
     "--set": {
         "metavar": "KEY=VALUE",
         "action": "append",
@@ -128,13 +122,13 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     },
     "--cameras": {
         "metavar": "F",
-        "type": Path,
+        "type": any_path,
         "help": f"cameras to render from: {CAMERA_FILES} (default: those "
         "beside REF or IN or in its folder, if they show the scene, else automatic views)",
     },
     "--images": {
         "metavar": "DIR",
-        "type": Path,
+        "type": any_path,
         "help": "photographs of --cameras, matched by name, to score against as well; images have "
         "their size if it is smaller than that of --cameras, unless --size is given",
     },

@@ -19,13 +19,13 @@ from cvtgs.cli.options import (
     check_written_files,
     checkpoint_of,
     count,
-    file,
     preset_of,
     ratio,
     read_axes,
     read_scene,
     read_settings,
 )
+from cvtgs.cli.paths import any_path, new_file
 from cvtgs.errors import (
     ConfigError,
     FileFormatError,
@@ -126,14 +126,14 @@ def add_simplify(add_parser: AddParser) -> None:
     )
     parser.add_argument(
         "--keep",
-        type=Path,
+        type=any_path,
         metavar="BOX.json",
         help="boxes whose Gaussians stay unchanged; they come first in OUT and count towards its "
         'size: {"min": [x, y, z], "max": [x, y, z]}, or a list of these',
     )
     add_block_options(parser)
     parser.add_argument(
-        "--report", type=file, metavar="R.json", help="file for a JSON report of the run"
+        "--report", type=new_file, metavar="R.json", help="file for a JSON report of the run"
     )
     add_options(parser, "--sh-degree", "--axes", "--lod", "--device", "--trust-sizes")
     add_options(parser, "--overwrite", "--quiet")

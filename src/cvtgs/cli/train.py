@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import cvtgs
 from cvtgs.cli.display import progress_bars, say
 from cvtgs.cli.options import AddParser, add_options
+from cvtgs.cli.paths import any_path
 from cvtgs.errors import OutputError, how_to_install
 
 if TYPE_CHECKING:
@@ -26,13 +27,13 @@ def add_train(add_parser: AddParser) -> None:
     )
     parser.set_defaults(run=train)
     parser.add_argument(
-        "config", metavar="CONFIG.toml", type=Path, help="configuration of the training"
+        "config", metavar="CONFIG.toml", type=any_path, help="configuration of the training"
     )
     parser.add_argument(
         "-o",
         "--output",
         required=True,
-        type=Path,
+        type=any_path,
         metavar="NAME.safetensors",
         help="checkpoint to write",
     )
@@ -40,7 +41,7 @@ def add_train(add_parser: AddParser) -> None:
         "--scenes",
         action="append",
         default=[],
-        type=Path,
+        type=any_path,
         metavar="DIR",
         help="directory of PLY files to train on, besides those of CONFIG.toml; can be repeated",
     )
@@ -54,7 +55,7 @@ def add_train(add_parser: AddParser) -> None:
     )
     parser.add_argument(
         "--cache",
-        type=Path,
+        type=any_path,
         metavar="DIR",
         help="directory of prepared scenes (default: NAME.cache)",
     )

@@ -2,7 +2,6 @@
 
 import argparse
 import webbrowser
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cvtgs
@@ -12,10 +11,10 @@ from cvtgs.cli.options import (
     PRESET_NAMES,
     AddParser,
     add_options,
-    file,
     is_same_file,
     ratio,
 )
+from cvtgs.cli.paths import any_path, new_file
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import write_atomically
 
@@ -40,7 +39,11 @@ def add_view(add_parser: AddParser) -> None:
     parser.set_defaults(run=view)
     add_options(parser, "input")
     parser.add_argument(
-        "small", metavar="SMALL", type=Path, nargs="*", help="scenes to switch to, in any format"
+        "small",
+        metavar="SMALL",
+        type=any_path,
+        nargs="*",
+        help="scenes to switch to, in any format",
     )
     add_options(
         parser,
@@ -52,7 +55,7 @@ def add_view(add_parser: AddParser) -> None:
     )
     parser.add_argument(
         "--page",
-        type=file,
+        type=new_file,
         metavar="F.html",
         help="write the page to a file that needs no server, instead of serving it; its time line "
         "switches between the scenes",
