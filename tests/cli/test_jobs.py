@@ -314,6 +314,18 @@ def test_a_scene_is_not_written_to_a_terminal(
     )
 
 
+def test_a_scene_is_not_read_from_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    typed = io.TextIOWrapper(io.BytesIO())
+    monkeypatch.setattr(typed, "isatty", lambda: True)
+    monkeypatch.setattr(sys, "stdin", typed)
+    assert main(["info", "-"]) == 1
+    assert capsys.readouterr().err == (
+        "cvtgs: error: standard input must be a pipe or a file, found a terminal.\n"
+    )
+
+
 def test_a_plain_run_makes_no_temporary_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -94,6 +94,8 @@ def test_without_a_command_the_help_is_printed(capsys):
         (["simplify", "in.ply", "out.ply", "--rhoo=0.1"], ": --rhoo; did you mean --rho?\n"),
         (["evaluate", "a.ply", "b.ply", "--backend", "numbaa"], "; did you mean numba?\n"),
         (["info", "a.ply", "--zzz"], "unrecognized argument: --zzz\n"),
+        (["simplify", "a.ply", "b.ply", "-rho", "1"], ": -rho; did you mean --rho?\n"),
+        (["render", "a.ply", "-o", "d", "-overwrite"], ": -overwrite; did you mean --overwrite?\n"),
         *(
             (
                 ["simplify", "in.ply", "out.ply", "--rho", rho],

@@ -144,6 +144,8 @@ def input_file(source: str | Path) -> Iterator[Path]:
 
     if sys.stdin is None:
         raise InputError("standard input must be a pipe or a file, found none.")
+    if sys.stdin.isatty():
+        raise InputError("standard input must be a pipe or a file, found a terminal.")
     with file_of(sys.stdin.buffer, name=STANDARD_INPUT, advice=_OTHER_FORMATS) as path:
         yield path
 

@@ -203,6 +203,8 @@ class CommandParser(argparse.ArgumentParser):
                 name = word.partition("=")[0]
                 if name.startswith("--") and not any(one.startswith(name) for one in options):
                     self.error(f"unrecognized argument: {name}{suggestion(name, options)}")
+                if f"-{name}" in options:  # else -output means -o utput
+                    self.error(f"unrecognized argument: {name}; did you mean -{name}?")
         known, rest = super().parse_known_args(args, namespace)
         if self.check is not None:  # allows paths between options
             known.paths += [word for word in rest if word == "-" or not word.startswith("-")]
