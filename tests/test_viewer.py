@@ -306,6 +306,36 @@ def test_the_command_writes_a_page(
     assert "a.html: the output must not exist yet" in capsys.readouterr().err
 
 
+def test_the_title_of_a_standalone_page_names_the_scenes(
+    scene: GaussianScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    html = "<title>Viser</title><svg><title>Viser</title></svg>"
+    monkeypatch.setattr(viser_stand_in.Recorder, "as_html", lambda *_, **__: html)
+    page = scene_page({"<a>.ply": scene, r"b\1.ply": random_scene(7)})
+    assert page.startswith(r"<title>Scenes in 3D: &lt;a&gt;.ply, b\1.ply</title><svg><title>Viser")
+
+
+def test_options_of_a_server_are_refused_for_a_standalone_page(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["view", str(tmp_path / "a.ply"), "--page", str(tmp_path / "a.html")]
+    for more in (["--port", "99"], ["--host", "localhost"], ["--no-browser"]):
+        assert main([*words, *more]) == 1
+        assert "are for serving the page, and cannot be used with --page" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_names_that_are_not_utf8_are_escaped(tmp_path: Path, scene: GaussianScene) -> None:
+    one, other = tmp_path / "a.ply", tmp_path / "b\udcff.ply"
+    save(scene, one)
+    save(random_scene(7), other)
+    assert main(["view", str(one), str(other), "--page", str(tmp_path / "a.html"), "--quiet"]) == 0
+    stand = viser_stand_in.ViserServer.latest
+    for text in (*stand.scene.labels.values(), *stand.gui.controls["show"].options):
+        text.encode()
+    assert r"b\udcff.ply" in stand.gui.controls["show"].options[-1]
+
+
 def test_a_page_does_not_replace_a_scene(
     tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
 ) -> None:

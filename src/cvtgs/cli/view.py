@@ -17,6 +17,7 @@ from cvtgs.cli.options import (
 from cvtgs.cli.paths import any_path, new_file
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import write_atomically
+from cvtgs.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -104,6 +105,13 @@ def view(options: argparse.Namespace) -> None:
     cvtgs.SimplifyConfig.compose(preset=preset)
     if not 0 < options.port < 1 << 16:
         raise InvalidArgumentError(f"--port must be from 1 to 65535, found {options.port}.")
+    if options.page is not None and (
+        options.no_browser or (options.host, options.port) != (HOST, PORT)
+    ):
+        raise InvalidArgumentError(
+            "--host, --port and --no-browser are for serving the page, and cannot be used with "
+            "--page."
+        )
     small = expanded(options.small)
     names = [options.input, *small]
     if options.page is not None:
@@ -114,7 +122,7 @@ def view(options: argparse.Namespace) -> None:
             )
     check_viewer()
     scene, *others = (cvtgs.load(path, trust_sizes=options.trust_sizes) for path in names)
-    named = {str(path): other for path, other in zip(small, others, strict=True)}
+    named = {printable(str(path)): other for path, other in zip(small, others, strict=True)}
     viewer = SceneViewer(scene, named, device=options.device)
     server = ViewerServer(
         viewer, host=options.host, port=options.port, preset=preset, rho=options.rho

@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -25,7 +26,7 @@ from cvtgs.math.frames import robust_frame
 from cvtgs.math.parameters import build_covariances, normalize_quats
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
-from cvtgs.text import counted, printable
+from cvtgs.text import counted, printable, shortened
 from cvtgs.validity import valid_part
 from cvtgs.viewer.scenes import FULL, SIMPLIFIED, SceneViewer, camera_of
 from cvtgs.views import automatic_views
@@ -85,7 +86,8 @@ class SceneNode:
     """A scene on a server, and a label with its name that is shown and hidden with it."""
 
     def __init__(self, server: "viser.ViserServer", name: str, path: str, *, label: Point) -> None:
-        self._server, self._name, self._path, self._label = server, name, path, label
+        self._server, self.name = server, printable(name)
+        self._path, self._label = path, label
         self._splats: Any = None
 
     def draw(self, scene: GaussianScene, *, visible: bool) -> None:
@@ -102,7 +104,7 @@ class SceneNode:
         )
         self._server.scene.add_label(
             f"{self._path}/name",
-            f"{self._name}: {counted(len(part), 'Gaussian')}",
+            f"{self.name}: {counted(len(part), 'Gaussian')}",
             position=self._label,
         )
 
@@ -118,7 +120,10 @@ def record_page(server: "viser.ViserServer", nodes: Sequence[SceneNode]) -> str:
         for node in nodes:
             node.show(node is shown)
         recorder.insert_sleep(_FLIP_SECONDS)
-    return str(recorder.as_html(dark_mode=True))
+    names = shortened(", ".join(node.name for node in nodes), 120)
+    title = f"<title>Scenes in 3D: {escape(names)}</title>"
+    page = str(recorder.as_html(dark_mode=True))
+    return re.sub("<title>.*?</title>", lambda _: title, page, count=1)
 
 
 def look_at(server: "viser.ViserServer", scene: GaussianScene) -> Point:
