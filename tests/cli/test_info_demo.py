@@ -134,6 +134,7 @@ def test_demo_replaces_only_files_of_an_earlier_demo(tmp_path, capsys, name):
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_effects_are_no_matter_of_checkpoints(capsys):
-    assert main(["info", "standard", "--effects", "sh=1"]) == 1
-    assert "--effects applies to scenes" in capsys.readouterr().err
+@pytest.mark.parametrize("words", [["--effects", "sh=1"], ["--lod", "0"]])
+def test_options_of_scenes_are_no_matter_of_checkpoints(capsys, words):
+    assert main(["info", "standard", *words]) == 1
+    assert f"{words[0]} applies to scenes" in capsys.readouterr().err

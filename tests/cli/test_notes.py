@@ -136,6 +136,12 @@ def test_cameras_that_are_not_used_are_mentioned(capsys, source):
     cameras = write_cameras(source.with_name("views.json"))
     text = simplified(capsys, source, "--rho", "0.1", "--cameras", cameras)
     assert "--cameras was not used: draft renders no images." in text
+    words = ("levels", source, "--preset", "draft", "--rho", "0.1", "--cameras", cameras)
+    for name, more in (("plain", ["--no-scores"]), ("stream", ["--stream", "sog"])):
+        text = printed(capsys, *words, "-o", source.with_name(name), *more)
+        assert text.startswith("--cameras is not used: draft renders no images.")
+    text = printed(capsys, *words, "-o", source.with_name("scored"), "--size", "48")
+    assert "--cameras" not in text
 
 
 @pytest.mark.parametrize(

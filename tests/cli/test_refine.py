@@ -68,6 +68,14 @@ def test_refinement_is_off_by_default(source, tmp_path):
             ["--refine-steps", "-2"],
             "refine.steps: input should be greater than or equal to 0, found '-2'.",
         ),
+        *(
+            (
+                ["--refine", seconds, "--refine-steps", steps],
+                "--refine and --refine-steps must both be above 0, or one of them be left out: 0 "
+                f"turns refinement off; found {seconds} and {steps}.",
+            )
+            for seconds, steps in (("0", "5"), ("2.5", "0"))
+        ),
     ],
 )
 def test_invalid_limits_are_refused_before_the_work(tmp_path, capsys, words, text):

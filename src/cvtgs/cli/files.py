@@ -173,8 +173,9 @@ def show_info(options: argparse.Namespace) -> None:
     path = options.input
     is_shipped = str(path) in cvtgs.mergenet.SHIPPED and not path.exists()
     if is_shipped or path.suffix == ".safetensors":
-        if options.effects is not None:
-            raise InvalidArgumentError("--effects applies to scenes, and cannot be used here.")
+        for word in ("effects", "lod"):
+            if getattr(options, word) is not None:
+                raise InvalidArgumentError(f"--{word} applies to scenes, and cannot be used here.")
         checkpoint = cvtgs.mergenet.load_checkpoint(path)
         _show(options, checkpoint.info, checkpoint_rows(checkpoint))
         return

@@ -95,6 +95,9 @@ def levels(options: argparse.Namespace) -> None:
         file=options.config, preset=preset_of(options), settings=read_settings(options.settings)
     )
     checkpoint = checkpoint_of(options)
+    is_scored = options.stream is None and not options.no_scores
+    if options.cameras is not None and not (is_scored or config.uses_images or options.quiet):
+        say_wrapped(f"--cameras is not used: {config.preset} renders no images.")
     if options.stream is not None and stream_blocks(options, checkpoint, config, rhos, axes):
         return
     with progress_bars(quiet=options.quiet) as listener:
@@ -123,7 +126,7 @@ def levels(options: argparse.Namespace) -> None:
             axes=axes.target,
             overwrite=options.overwrite,
         )
-        if not options.no_scores:
+        if is_scored:
             files = {
                 name: cvtgs.load(options.output / name, axes=axes.target, trust_sizes=True)
                 for name in names

@@ -264,8 +264,14 @@ def _write_report(options: argparse.Namespace, report: "SimplifyReport") -> None
 
 def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
     """Return the settings of ``--refine`` and ``--refine-steps``; either option sets both."""
-    if options.refine is None and options.refine_steps is None:
+    limits = (options.refine, options.refine_steps)
+    if limits == (None, None):
         return {}
+    if None not in limits and 0 in limits and limits != (0, 0):
+        raise InvalidArgumentError(
+            "--refine and --refine-steps must both be above 0, or one of them be left out: 0 turns "
+            f"refinement off; found {options.refine:g} and {options.refine_steps}."
+        )
     steps, seconds = options.refine_steps or 0, options.refine or 0.0
     return {"refine.steps": str(steps), "refine.seconds": str(seconds)}
 
