@@ -7,7 +7,15 @@ import pydantic
 import pytest
 import torch
 
-from cvtgs import ProgressEvent, Simplifier, SimplifyConfig, SimplifyReport, describe
+from cvtgs import (
+    Cameras,
+    ProgressEvent,
+    Simplifier,
+    SimplifyConfig,
+    SimplifyReport,
+    describe,
+    render,
+)
 from cvtgs.clock import StageClock, StageCost, peak_memory_bytes
 from cvtgs.progress import silent
 from scenes import random_scene
@@ -117,3 +125,16 @@ def test_the_silent_listener_prints_nothing(capsys):
 def test_records_with_dictionaries_are_not_hashable():
     assert not isinstance(report_of(), Hashable)
     assert not isinstance(describe(random_scene(3)), Hashable)
+
+
+def test_objects_with_tensors_have_a_short_repr():
+    scene = random_scene(1200)
+    prepared = Simplifier(preset="draft", device="cpu").prepare(scene)
+    level = prepared.levels([0.01])[0]
+    assert repr(prepared) == f"Prepared({scene!r}, preset draft, device cpu)"
+    assert repr(level) == f"Level({level.scene!r}, {level.report!r}, error {level[2]:.3g})"
+    eye = torch.eye(4)[None]
+    cameras = Cameras(viewmats=eye, Ks=eye[:, :3, :3], width=30, height=20)
+    assert repr(cameras) == "Cameras(1 of 30 x 20 pixels, cpu)"
+    found = render(scene, cameras, backend="torch")
+    assert repr(found) == "Rendering(1 image of 30 x 20 pixels, torch, cpu)"

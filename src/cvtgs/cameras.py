@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Self
+from typing import Any, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -77,6 +77,10 @@ class Cameras:
         for stride in self.strides:
             check_whole(stride, "every stride")
 
+    def __repr__(self) -> str:
+        """Return number, image size and device, not the matrices."""
+        return f"Cameras({len(self)} of {self.width} x {self.height} pixels, {self.Ks.device})"
+
     def __len__(self) -> int:
         """Return the number of cameras."""
         return len(self.viewmats)
@@ -108,18 +112,12 @@ class Cameras:
         """
         device = rows.device if isinstance(rows, Tensor) else torch.device("cpu")
         rows = row_numbers(rows, len(self), things="cameras", device=device)
-        names, strides, ignores_tag = (
-            tuple(values[row] for row in rows.tolist()) if values else ()
-            for values in (self.names, self.strides, self.ignores_tag)
-        )
-        return replace(
-            self,
-            viewmats=self.viewmats[rows],
-            Ks=self.Ks[rows],
-            names=names,
-            strides=strides,
-            ignores_tag=ignores_tag,
-        )
+        entries: dict[str, Any] = {
+            name: tuple(values[row] for row in rows.tolist())
+            for name in ("names", "strides", "ignores_tag")
+            if (values := getattr(self, name))
+        }
+        return replace(self, viewmats=self.viewmats[rows], Ks=self.Ks[rows], **entries)
 
     def singles(self) -> list[Self]:
         """Split into single cameras.

@@ -92,6 +92,9 @@ class Prepared:
         self._move_note = ""  # for all runs after a fallback to another device
         self._forget()
 
+    def __repr__(self) -> str:
+        return f"Prepared({self._scene!r}, preset {self._config.preset}, device {self._device})"
+
     def _forget(self) -> None:
         """Release everything that is cached on the device."""
         self._net: Net | None = None

@@ -201,3 +201,7 @@ class Level(NamedTuple):
     report: SimplifyReport
     geometric_error: float
     assignment: Int[Tensor, "n"] | None = None
+
+    def __repr__(self) -> str:
+        """Return scene, report and error, not the assignment."""
+        return f"Level({self.scene!r}, {self.report!r}, error {self.geometric_error:.3g})"

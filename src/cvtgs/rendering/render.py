@@ -22,7 +22,7 @@ from cvtgs.rendering.backends import (
     without_gradients,
 )
 from cvtgs.scene import GaussianScene, SceneLike, as_scene, check_scene
-from cvtgs.text import shown
+from cvtgs.text import counted, shown
 
 LEAST_ERROR = 1e-12  # mean squared error below which images count as equal
 
@@ -44,6 +44,12 @@ class Rendering:
     alpha: Float[Tensor, "c h w"]
     depth: Float[Tensor, "c h w"] | None
     backend: str
+
+    def __repr__(self) -> str:
+        """Return number, size, renderer and device of the images, not their values."""
+        count, height, width = self.alpha.shape
+        size = f"{counted(count, 'image')} of {width} x {height} pixels"
+        return f"Rendering({size}, {self.backend}, {self.alpha.device})"
 
 
 @without_autocast()
