@@ -123,6 +123,7 @@ def test_wrong_arguments_are_refused_before_files_are_written(scene, simplifier,
         (levels, [0.01, -3], r"rho must be above 0 and at most 1; found -3\."),
         (levels, [0.01, math.nan], r"rho must be above 0 and at most 1; found nan\."),
         (levels, [0.01, "a"], r"rho must be a number above 0 and at most 1; found 'a'\."),
+        (levels, [0.02, 0.01], r"in their order; found 0\.02 for 30 of 3,000 Gaussians\."),
         (levels, 0.01, r"ratios must be a list of numbers, found 0\.01\."),
     ):
         with pytest.raises(InvalidArgumentError, match=message):

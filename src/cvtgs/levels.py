@@ -9,7 +9,7 @@ import torch
 
 from cvtgs.boxes import Corner
 from cvtgs.config.base import Record
-from cvtgs.counts import written, written_ratios
+from cvtgs.counts import target_count, written, written_ratios
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import Evaluation, SceneScores
 from cvtgs.evaluation.scorer import mean_of
@@ -17,7 +17,7 @@ from cvtgs.io import check_output, check_save, load, save
 from cvtgs.io.atomic import make_folder, write_atomically
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.report import Level
-from cvtgs.text import printable
+from cvtgs.text import counted, printable
 
 __all__ = ["LevelEntry", "LevelsIndex", "write_levels"]
 
@@ -144,8 +144,8 @@ def write_levels(
         The index, the finest level first.
 
     Raises:
-        InvalidArgumentError: There is no level, or the ratios are not one per level, all different
-            and in (0, 1].
+        InvalidArgumentError: There is no level, or the ratios are not those of the levels, all
+            different and in (0, 1].
         OutputExistsError: A file exists and may not be replaced.
         OutputError: A file cannot be written.
 
@@ -171,6 +171,13 @@ def write_levels(
         raise InvalidArgumentError(
             f"rhos must differ, since they name the files, found {twice[0]} twice."
         )
+    for level, rho in zip(levels, ratios, strict=True):
+        made = level.report
+        if target_count(made.input_count, rho) != made.target_count:
+            raise InvalidArgumentError(
+                f"rhos must be the ratios of the levels, in their order; found {rho} for "
+                f"{made.target_count:,} of {counted(made.input_count, 'Gaussian')}."
+            )
     check_levels(place, names, overwrite=overwrite)
     entries = []
     for level, rho, name in zip(levels, ratios, names, strict=True):
