@@ -1,10 +1,12 @@
 """Options of commands that work block by block, and the workers that they choose."""
 
 import argparse
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from typing import TYPE_CHECKING
 
+from cvtgs.cli.display import say
 from cvtgs.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -50,15 +52,29 @@ def memory_of(options: argparse.Namespace) -> int:
 def block_workers(
     options: argparse.Namespace, memory: int
 ) -> Iterator[tuple["Workers | None", int]]:
-    """Return workers, None for this process alone, and the bytes that each may use."""
+    """Return workers, None for this process alone, and the bytes that each may use.
+
+    After an interrupt, print where the finished steps are.
+    """
+    from cvtgs.io.locks import hidden_path
     from cvtgs.outofcore import ClusterWorkers, LocalWorkers, connect
     from cvtgs.outofcore.memory import worker_count
 
-    with ExitStack() as stack:
-        if options.scheduler is not None:
-            client = stack.enter_context(closing(connect(options.scheduler)))
-            yield ClusterWorkers(client), memory
-        elif (count := worker_count(memory, options.workers)) > 1:
-            yield stack.enter_context(LocalWorkers(count)), memory // count
-        else:
-            yield None, memory
+    kept = hidden_path(options.output, "blocks")
+    try:
+        with ExitStack() as stack:
+            if options.scheduler is not None:
+                client = stack.enter_context(closing(connect(options.scheduler)))
+                yield ClusterWorkers(client), memory
+            elif (count := worker_count(memory, options.workers)) > 1:
+                yield stack.enter_context(LocalWorkers(count)), memory // count
+            else:
+                yield None, memory
+    except KeyboardInterrupt:
+        if kept.is_dir():
+            say(
+                f"cvtgs: {kept} has the finished steps, with which the same command continues; "
+                "delete it if that is not wanted.",
+                file=sys.stderr,
+            )
+        raise
