@@ -16,7 +16,7 @@ from torch import Tensor
 
 from cvtgs.checks import check_kinds
 from cvtgs.errors import InvalidArgumentError, check_path, input_errors
-from cvtgs.text import MOST_LETTERS, shortened, shown
+from cvtgs.text import MOST_LETTERS, counted, shortened, shown
 
 __all__ = [
     "Box",
@@ -174,6 +174,7 @@ def check_room(kept: int, *, target: int, total: int) -> None:
     needed = kept + (1 if kept < total else 0)
     if kept and min(target, total) < needed:
         raise InvalidArgumentError(
-            f"{kept:,} Gaussians are protected, so the target must be at least {needed:,} of the "
-            f"{total:,} Gaussians (rho {needed / total:.4g} or more), found {target:,}."
+            f"{counted(kept, 'Gaussian')} {'is' if kept == 1 else 'are'} protected, so the target "
+            f"must be at least {needed:,} of the {total:,} Gaussians (rho {needed / total:.4g} or "
+            f"more), found {target:,}."
         )

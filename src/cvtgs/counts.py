@@ -157,7 +157,7 @@ def check_whole(
 
 def shortfall(valid: int, total: int, target: int) -> str:
     """Return the reason why fewer Gaussians are kept than asked for; empty if there is none."""
-    return f"only {valid} of {total} Gaussians are valid" if valid < target else ""
+    return f"only {valid:,} of {total:,} Gaussians are valid" if valid < target else ""
 
 
 def spread_rows(length: int, count: int) -> tuple[int, ...]:

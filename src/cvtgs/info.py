@@ -92,7 +92,7 @@ def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInf
     invalid = invalid_rows(scene)
     bad = any_row(scene, invalid)
     if len(scene) == int(bad.sum()):
-        raise InvalidSceneError(f"none of the {len(scene)} Gaussians is valid.")
+        raise InvalidSceneError(f"none of the {len(scene):,} Gaussians is valid.")
     valid = scene.select(~bad) if invalid else scene
     config = config or SimplifyConfig()
     analysis = analyze(select_columns(valid, config.effects), config)

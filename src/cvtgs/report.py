@@ -182,7 +182,7 @@ class Simplified(NamedTuple):
 
 def origin_of_views(cameras: Cameras | None) -> str:
     """Return the origin of rendered views: given cameras, or views that were generated."""
-    return "found" if cameras is None else f"{len(cameras)} cameras"
+    return "found" if cameras is None else counted(len(cameras), "camera")
 
 
 class Level(NamedTuple):

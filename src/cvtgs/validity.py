@@ -64,14 +64,15 @@ def check_rows(scene: GaussianScene) -> CheckedScene:
     dropped = any_row(scene, invalid)
     count = int(dropped.sum())
     reasons = {name: int(mask.sum()) for name, mask in invalid.items()}
-    text = ", ".join(f"{name} {number}" for name, number in reasons.items())
+    text = ", ".join(f"{name} {number:,}" for name, number in reasons.items())
     if count == len(scene):
         raise InvalidSceneError(
-            f"none of the {len(scene)} Gaussians is valid; "
+            f"none of the {len(scene):,} Gaussians is valid; "
             f"found NaN, infinite or zero values in {text}."
         )
     warn(
-        f"dropped {count} of {len(scene)} Gaussians with NaN, infinite or zero values ({text}).",
+        f"dropped {count:,} of {len(scene):,} Gaussians with NaN, infinite or zero values "
+        f"({text}).",
         DroppedDataWarning,
     )
     return CheckedScene(scene.select(~dropped), reasons, count, ~dropped)

@@ -198,3 +198,25 @@ def test_presets_that_were_fitted_to_cameras_are_named(capsys, source, count, te
         assert fitted == "28 cameras"
     else:
         assert (views, fitted) == (["0.png", "1.png"], "2 cameras")
+
+
+def test_one_gaussian_is_no_plural(capsys, source):
+    one, again = source.with_name("one.ply"), source.with_name("again.ply")
+    for path in (one, again):
+        cvtgs.save(random_scene(1), path)
+    views = ["--views", "1", "--size", "16"]
+    text = printed(capsys, "evaluate", one, again, *views)
+    assert "against one.ply, 1 Gaussian: " in text
+    text = printed(capsys, "levels", one, "-o", source.with_name("levels"), *views, "--rho", "1")
+    assert text.startswith("one.ply, 1 Gaussian: ")
+
+
+def test_dropped_rows_are_counted_with_separators(capsys, source):
+    scene = random_scene(1200)
+    scene.means[:1100] = torch.nan
+    cvtgs.save(scene, source, overwrite=True)
+    text = simplified(capsys, source, "--rho", "0.5")
+    assert (
+        "dropped 1,100 of 1,200 Gaussians with NaN, infinite or zero values (means 1,100)" in text
+    )
+    assert "Fewer than the requested 600: only 100 of 1,200 Gaussians are valid." in text

@@ -145,11 +145,12 @@ def test_ratios_of_other_sizes_are_told_apart(tmp_path):
         EvaluationSettings(lpips="off"),
     )
     small = scene.select(torch.arange(50))
-    others = {"larger": scene, "hardly smaller": small.select(torch.arange(49))}
+    others = {"larger": scene, "hardly smaller": small.select(torch.arange(49)), "one": scene[:1]}
     write_comparison(compare(small, others, cameras, settings=settings), tmp_path)
     html = dom(tmp_path / "index.html")
     assert "<b>6\u00d7 more</b>" in html
     assert "<b>1.02\u00d7 fewer</b>" in html
+    assert "1 Gaussian \u00b7 one" in html
 
 
 @pytest.mark.slow

@@ -181,7 +181,7 @@ def test_invalid_rows_are_counted(tmp_path: Path, scene: GaussianScene) -> None:
     means = scene.means.clone()
     means[[5, 77]] = torch.nan
     save(scene.with_tensors({"means": means}, {}), tmp_path / "bad.ply")
-    with pytest.warns(DroppedDataWarning, match="dropped 2 of 4000 Gaussians"):
+    with pytest.warns(DroppedDataWarning, match="dropped 2 of 4,000 Gaussians"):
         report = stream(tmp_path / "bad.ply", tmp_path / "out")
     assert [level.gaussians for level in report.levels] == [3998, 1000, 200, 50]
 

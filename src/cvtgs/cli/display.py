@@ -134,7 +134,7 @@ def report_notes(report: "SimplifyReport") -> list[str]:
         each = matched.views // report.blocks  # every block has held-out images of its own
         where = "every eighth of them" if heldout_rows(each) else "the same images"
         notes.append(
-            f"Matched to {matched.views} images of the scene: "
+            f"Matched to {counted(matched.views, 'image')} of the scene: "
             f"{matched.psnr_after - matched.psnr_before:+.2f} dB on {where}."
         )
     if report.refinement is not None:

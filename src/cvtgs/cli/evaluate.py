@@ -175,7 +175,7 @@ def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
         f"{counted(len(evaluation.views), 'view')} "
         f"of {evaluation.width} x {evaluation.height} pixels, rendered by {evaluation.backend}"
     )
-    say(f"against {evaluation.reference}, {evaluation.reference_count:,} Gaussians:")
+    say(f"against {evaluation.reference}, {counted(evaluation.reference_count, 'Gaussian')}:")
     _print_score_table(evaluation.scenes, sizes)
     say(ALPHA_MEANS)
     if evaluation.photographs:

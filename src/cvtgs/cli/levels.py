@@ -27,7 +27,7 @@ from cvtgs.cli.options import (
 from cvtgs.cli.streams import add_stream_options, check_stream_options, stream_blocks, stream_levels
 from cvtgs.cli.view import check_page, write_page
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.text import printable, size_text
+from cvtgs.text import counted, printable, size_text
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation
@@ -175,7 +175,7 @@ def _score(
 
 
 def _print_index(index: "LevelsIndex") -> None:
-    say(f"{index.source}, {index.source_count:,} Gaussians:")
+    say(f"{index.source}, {counted(index.source_count, 'Gaussian')}:")
     rows = [["", "Gaussians", "size", "error", "PSNR", "alpha", "seconds"]]
     for level in index.levels:
         psnr = "-" if level.psnr is None else f"{level.psnr:.2f}"

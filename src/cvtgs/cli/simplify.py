@@ -173,7 +173,7 @@ def _simplify_one(
         if memory is not None:
             simplifier = cvtgs.Simplifier(checkpoint, config=config, device="cpu")
             report = _simplify_blocks(options, simplifier, memory, listener)
-            if options.cameras is None and report.views.endswith(" cameras"):
+            if options.cameras is None and report.views not in ("found", "none"):
                 notes.append(f"Rendered from {report.views} found beside {options.input}.")
         else:
             report, notes = _simplify_in_memory(options, checkpoint, config, settings, listener)
@@ -221,7 +221,9 @@ def _simplify_in_memory(
         own = cvtgs.views.find_own_cameras(scene, options.input)
         if own is not None and axes.source is None:
             cameras = own.cameras
-            notes.append(f"Rendered from {len(cameras)} cameras found in {own.source.resolve()}.")
+            notes.append(
+                f"Rendered from {counted(len(cameras), 'camera')} found in {own.source.resolve()}."
+            )
     search = has_target(options)
     simplifier = cvtgs.Simplifier(
         checkpoint, config=config, device=options.device, listener=silent if search else listener

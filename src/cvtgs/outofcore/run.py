@@ -345,9 +345,9 @@ def report_blocks(
     refinements = [report.refinement for report in reports if report.refinement is not None]
     total, valid = job.source.count, scan.row_count + scan.kept_count
     if valid < total:
-        reasons = ", ".join(f"{name} {number}" for name, number in scan.invalid_rows.items())
+        reasons = ", ".join(f"{name} {number:,}" for name, number in scan.invalid_rows.items())
         warn(
-            f"dropped {total - valid} of {total} Gaussians with NaN, infinite or zero values "
+            f"dropped {total - valid:,} of {total:,} Gaussians with NaN, infinite or zero values "
             f"({reasons}).",
             DroppedDataWarning,
         )

@@ -220,7 +220,7 @@ def _on_device(
     for name, scene, rows in (("simplified", small, valid_rows(small)), ("full", full, valid)):
         if not bool(rows.any()):
             raise InvalidSceneError(
-                f"a refinement needs valid Gaussians in both scenes; none of the {len(scene)} of "
+                f"a refinement needs valid Gaussians in both scenes; none of the {len(scene):,} of "
                 f"the {name} scene is valid."
             )
     whole = full if bool(valid.all()) else full.select(valid)

@@ -335,8 +335,8 @@ def _write_targets(
     total = sum(rows)
     if total < spec.job.source.count:
         warn(
-            f"dropped {spec.job.source.count - total} of {spec.job.source.count} Gaussians with "
-            "NaN, infinite or zero values.",
+            f"dropped {spec.job.source.count - total:,} of {spec.job.source.count:,} Gaussians "
+            "with NaN, infinite or zero values.",
             DroppedDataWarning,
         )
     rooms, levels = list(rows), []

@@ -219,7 +219,7 @@ def cells(tradeoff: Tradeoff, result: TradeoffResult) -> Mapping[str, str]:
 def heading(tradeoff: Tradeoff, rho: float) -> str:
     """Return the table heading of a ratio."""
     count = max(result.count for result in tradeoff.results if result.rho == rho)
-    return f"rho {rho:g}: {count:,} of {tradeoff.source_count:,} Gaussians"
+    return f"rho {rho:g}: {count:,} of {counted(tradeoff.source_count, 'Gaussian')}"
 
 
 def how_measured(tradeoff: Tradeoff) -> str:

@@ -258,7 +258,7 @@ def viewable_part(scene: GaussianScene) -> GaussianScene:
     part = valid_part(scene)
     if len(part) == 0:
         raise InvalidSceneError(
-            f"automatic views need a scene with valid Gaussians; none of {len(scene)} is valid."
+            f"automatic views need a scene with valid Gaussians; none of {len(scene):,} is valid."
         )
     return part
 

@@ -27,6 +27,7 @@
     return `${number(factor, digits)}× ${word}`;
   };
   const join = (...parts) => parts.filter(Boolean).join(" · ");
+  const gaussians = (scene) => `${count(scene.count)} Gaussian${scene.count === 1 ? "" : "s"}`;
   const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
 
   const make = (tag, text, attributes = {}) => {
@@ -45,7 +46,7 @@
   ].filter(([, of]) => data.small.every((scene) => of(scene)));
 
   const maps = [
-    { key: "images", tag: (scene) => `${data.named ? scene.name : "Simplified"} · ${count(scene.count)}`, alt: (scene, name) => `${name} of ${scene.name}, ${count(scene.count)} Gaussians` },
+    { key: "images", tag: (scene) => `${data.named ? scene.name : "Simplified"} · ${count(scene.count)}`, alt: (scene, name) => `${name} of ${scene.name}, ${gaussians(scene)}` },
     { key: "errors", tag: () => "Colour error", alt: (scene, name) => `Where colours of ${scene.name} differ from the full scene in ${name}` },
     { key: "alpha_errors", tag: () => "Alpha error", alt: (scene, name) => `Where ${scene.name} covers less or more than the full scene in ${name}` },
   ];
@@ -78,13 +79,13 @@
     root.style.setProperty("--columns", clamp(views.length, 1, 8));
     at("title").textContent = reference.name;
     at("lead").textContent =
-      join(count(reference.count) + " Gaussians", bytes(reference.bytes)) +
+      join(gaussians(reference), bytes(reference.bytes)) +
       `, next to ${small.length === 1 ? "a simplified version" : small.length + " simplified versions"}` +
       ` from ${views.length === 1 ? "one view" : views.length + " views"}. Drag the divider: full on the left, simplified on the right.`;
     at("scenes").append(...small.map((scene, index) => choice("small", index + 1, [
       make("b", data.named ? scene.name : difference(scene)),
       make("span", decibels(scene.psnr.mean), { class: "psnr" }),
-      make("small", join(count(scene.count) + " Gaussians", bytes(scene.bytes), data.named ? "" : scene.name)),
+      make("small", join(gaussians(scene), bytes(scene.bytes), data.named ? "" : scene.name)),
     ])));
     at("views").append(...views.map((name, index) => choice("view", index + 1, [
       make("img", undefined, { src: data.full[index], alt: name, title: name, loading: "lazy" }),
@@ -102,7 +103,7 @@
     const name = data.views[state.view - 1];
     const index = state.view - 1;
     at("full").src = data.full[index];
-    at("full").alt = `${name} of ${data.reference.name}, ${count(data.reference.count)} Gaussians`;
+    at("full").alt = `${name} of ${data.reference.name}, ${gaussians(data.reference)}`;
     const map = maps[state.error];
     at("small").src = scene[map.key][index];
     at("small").alt = map.alt(scene, name);
