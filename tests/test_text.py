@@ -11,7 +11,7 @@ import pytest
 
 import cvtgs
 from cvtgs.cli.main import main
-from cvtgs.text import printable, shown, size_text
+from cvtgs.text import columns, printable, shortened, shown, size_text
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
 
 CLI = Path(cvtgs.__file__).parent / "cli"
@@ -28,6 +28,15 @@ def test_size_text():
         "68.0 MB",
         "2.0 GB",
     ]
+
+
+def test_texts_are_shortened_to_letters_and_to_columns():
+    assert shortened("abcdefgh", 8) == "abcdefgh"
+    assert shortened("abcdefghi", 8) == "abcde..."
+    assert shortened("\u6f22" * 4, 8) == "\u6f22" * 4
+    assert shortened("\u6f22" * 5, 8) == "\u6f22\u6f22..."
+    assert columns(shortened("\u6f22" * 99, 21)) == 21
+    assert len(shortened("a" + "\u0301" * 1000, 8)) == 8
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,13 @@ MOST_LETTERS = 60  # maximum length of a value in an error message
 
 
 def shortened(text: str, length: int) -> str:
-    """Truncate a text to a maximum length."""
-    return text if len(text) <= length else f"{text[: length - 3]}..."
+    """Truncate a text to a maximum number of letters, and of columns in a terminal."""
+    if max(len(text), columns(text)) <= length:
+        return text
+    kept = text[: length - 3]
+    while columns(kept) > length - 3:
+        kept = kept[:-1]
+    return f"{kept}..."
 
 
 def printable(text: str, encoding: str = "utf-8") -> str:
