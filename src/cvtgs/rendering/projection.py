@@ -131,11 +131,13 @@ def _check(viewmats: NDArray[np.float64], Ks: NDArray[np.float64]) -> None:  # n
     upright = (skews <= SKEW) & (volumes > 0)
     affine = np.abs(viewmats[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) <= SKEW
     pinhole = (Ks[:, 0, 0] > 0) & (Ks[:, 1, 1] > 0) & (Ks[:, 0, 1] == 0) & (Ks[:, 1, 0] == 0)
+    plain = np.abs(Ks[:, 2] - [0.0, 0.0, 1.0]).max(axis=1) <= SKEW
     for good, wish in (
         (finite, "finite viewmats and Ks"),
         (upright, "viewmats that rotate, with at most a uniform scale"),
         (affine, "viewmats with the last row 0, 0, 0, 1"),
         (pinhole, "Ks of pinhole cameras, focal lengths above 0 and no skew"),
+        (plain, "Ks with the last row 0, 0, 1"),
     ):
         bad = np.flatnonzero(~good)
         if bad.size:
