@@ -325,6 +325,18 @@ def test_scenes_can_be_copied_and_sent_to_other_processes(copied):
     assert (other.comments, other.layout) == (scene.comments, scene.layout)
 
 
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NamedScene(GaussianScene):
+    name: str = ""
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda scene: pickle.loads(pickle.dumps(scene))])
+def test_copies_of_a_subclass_keep_its_fields(copied):
+    other = copied(NamedScene(**tensors_of(), name="garden"))
+    assert type(other) is NamedScene
+    assert (other.name, other[1:3].name) == ("garden", "garden")
+
+
 def test_scenes_are_joined_in_their_order():
     scene = random_scene(7).with_tensors({}, {"label": torch.arange(7)})
     parts = [scene.select(torch.arange(first, last)) for first, last in ((0, 2), (2, 3), (3, 7))]

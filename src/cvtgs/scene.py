@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pkgutil import resolve_name
 from types import MappingProxyType
@@ -312,8 +312,8 @@ class GaussianScene:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Support pickling and deep copies, which mapping proxies do not."""
-        values: dict[str, Any] = {**self.tensors(), "extras": dict(self.extras)}
-        values |= {"comments": self.comments, "layout": self.layout}
+        values = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
+        values["extras"] = dict(self.extras)
         return partial(type(self), **values), ()
 
     def __repr__(self) -> str:
