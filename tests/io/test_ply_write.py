@@ -16,6 +16,7 @@ from cvtgs.io.ply import write
 from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 from cvtgs.text import shown
 from ply_files import gaussian_properties, gaussian_rows, parse_header, write_ply_file
+from scenes import random_scene
 
 
 def make_scene(
@@ -205,6 +206,12 @@ def test_scenes_of_2dgs_are_written_without_a_third_scale(tmp_path: Path) -> Non
         "no scale_2 (2DGS)."
     )
     assert caught[0].filename == __file__
+
+
+def test_an_extra_column_named_like_packed_data_is_read_back(tmp_path: Path) -> None:
+    path, column = tmp_path / "scene.ply", torch.arange(3.0)
+    save(random_scene(3).with_tensors({}, {"packed_position": column}), path)
+    assert torch.equal(load(path).extras["packed_position"], column)
 
 
 def test_parameters_with_gradients_can_be_saved(tmp_path: Path) -> None:

@@ -214,7 +214,8 @@ def is_compressed_ply(path: Path) -> bool:
             elements = read_header(file, str(path)).elements
     except CvtgsError:
         return False
-    return any(prop.name == "packed_position" for table in elements for prop in table.properties)
+    tables = [{prop.name for prop in table.properties} for table in elements]
+    return any("packed_position" in names and "x" not in names for names in tables)
 
 
 def header_bytes(comments: Iterable[str], elements: Iterable[tuple[str, int, Layout]]) -> bytes:
