@@ -87,6 +87,18 @@ def test_a_refinement_with_images_of_its_own_renders_held_out_ones_too(name):
     assert counts[1] == refine.new_images(refine.steps) + refine.heldout
 
 
+def test_steps_on_few_gaussians_are_more_but_see_as_many_pixels():
+    matched = preset("matched")
+    once = SimplifyConfig.compose(preset="matched", settings={"refine.lengthening": "1"})
+    for target, times in ((400, 4), (100_000, 1)):
+        work = Work(count=10**6, target=target)
+        usual, more = (work.features("refine", one) for one in (once, matched))
+        assert more["look_pixels"] == usual["look_pixels"]
+        steps = matched.refine.steps * matched.refine.images_per_step
+        assert more["looks"] - usual["looks"] == (times - 1) * steps
+        assert more["looks_out"] == target * more["looks"]
+
+
 def test_the_shipped_rates_were_measured_on_the_trials_of_calibrations():
     """After a change of the trials: ``python -m benchmarks.cost_model --ship``."""
     found = shipped_model().trials

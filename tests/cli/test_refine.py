@@ -39,6 +39,15 @@ def test_steps_are_in_the_report_and_the_summary(source, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_steps_of_the_option_are_not_multiplied_for_few_gaussians(source, tmp_path):
+    report = tmp_path / "report.json"
+    words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.1"]
+    words += ["--preset", "matched", "--refine-steps", "5", "--report", str(report)]
+    assert main(words) == 0
+    assert json.loads(report.read_text())["refinement"]["steps"] == 5
+
+
+@pytest.mark.slow
 def test_refine_stops_at_its_time_limit_or_earlier(source, tmp_path):
     report = tmp_path / "report.json"
     words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.1"]

@@ -2,11 +2,15 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
-from cvtgs.refinement.images import ImageBuffer
+from cvtgs.config import RefineConfig
+from cvtgs.evaluation.scorer import render_views
+from cvtgs.refinement import refine
+from cvtgs.refinement.images import ImageBuffer, RefineViews
 from cvtgs.refinement.optimize import mean_loss
-from refine_cases import full_scene, quick, ring, small_scene, three_views
+from refine_cases import discolored, full_scene, quick, ring, small_scene, three_views
 
 
 def test_the_images_of_a_step_are_joined_by_their_size():
@@ -40,3 +44,51 @@ def test_backgrounds_are_random_and_seeded():
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
     assert 0 <= float(first.amin()) <= float(first.amax()) <= 1
+
+
+@pytest.mark.parametrize(
+    ("count", "thinning", "times"), [(300, 1, 1), (256, 2, 2), (100, 2, 3.2), (9, 2, 4)]
+)
+def test_few_gaussians_get_more_steps_of_fewer_pixels(count, thinning, times):
+    """At 64 x 64 pixels, 256 Gaussians have 16 each, as many as 4 x 4, and half of 4 is 2."""
+    config = RefineConfig(size=64, stride=2, steps=10, lengthening=4, half_after=20, check_every=5)
+    assert config.thinning(count) == thinning
+    found = config.for_count(count)
+    assert (found.steps, found.half_after) == (round(10 * times), round(20 * times))
+    assert (found.check_every, found.steps_per_image) == (round(5 * times), round(times))
+    assert found.rates == config.rates
+    never = config.model_copy(update={"lengthening": 1.0})
+    assert never.thinning(count) == 1
+    assert never.for_count(count) == never
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_thinned_steps_see_every_second_pixel_of_those_of_the_stride(stride):
+    full, cameras = full_scene(200), ring(1, width=62, height=46)
+    views = RefineViews(heldout=(), training=iter([cameras]), endless=False)
+    images = ImageBuffer(full, views, config=quick(stride=stride), seed=0, thinning=2)
+    whole, step, seen = render_views(full, cameras).rgb, 2 * stride, set()
+    for _ in range(60):
+        found = images.draw()
+        column, row = (
+            round(step * float(0.5 - shift) - 0.5)
+            for shift in found.cameras.Ks[0, :2, 2] - cameras.Ks[0, :2, 2] / step
+        )
+        seen.add((column, row))
+        part = whole[:, row::step, column::step]
+        torch.testing.assert_close(found.rgb.float(), part, rtol=1e-3, atol=1e-3)
+    assert len(seen) == step**2
+
+
+def test_images_that_are_too_small_for_ssim_are_not_thinned():
+    views = RefineViews(heldout=(), training=iter([ring(1, width=40, height=21)]), endless=False)
+    images = ImageBuffer(full_scene(50), views, config=quick(), seed=0, thinning=2)
+    assert images.draw().rgb.shape == (1, 21, 40, 3)
+
+
+@pytest.mark.parametrize(("steps", "found"), [(None, 12), (3, 3)])
+def test_only_configured_steps_are_multiplied(steps, found):
+    full = full_scene(60)
+    config = quick(steps=4, size=48, lengthening=3.0)
+    small = discolored(full.select(slice(0, 20)))
+    assert refine(small, full, steps=steps, config=config).report.steps == found

@@ -95,7 +95,8 @@ class Trial:
         if not config.uses_images:
             return config
         visibility = config.visibility.model_copy(update={"views": self.views, "size": self.size})
-        refine = config.refine.model_copy(update={"size": self.size, "steps": self.steps})
+        exact = {"size": self.size, "steps": self.steps, "lengthening": 1.0}
+        refine = config.refine.model_copy(update=exact)
         return config.model_copy(update={"visibility": visibility, "refine": refine})
 
 

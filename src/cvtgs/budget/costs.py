@@ -109,14 +109,15 @@ class Work:
         sample = max(sample, MIN_SAMPLES) if sample else self.count
         sample = self.count if sample >= self.count // 2 else sample
         searched = 0 if cells == self.count else self.count + config.cvt.iterations * sample
-        visibility, refine = config.visibility, config.refine
+        visibility, refine = config.visibility, config.refine.for_count(self.target)
         shared = visibility.views if config.shares_images else 0
         heldout = refine.heldout_of(shared) if shared else refine.heldout
         new_images = refine.new_images(refine.steps, shared=shared)
         batches = math.ceil(new_images / refine.batch) + (not shared)
         checks = 1 + math.ceil(refine.steps / refine.check_every)
-        renders = refine.steps * refine.images_per_step + SHARE_OF_A_STEP * heldout * checks
-        renders += STEPS_OF_A_BATCH * batches
+        drawn = refine.steps * refine.images_per_step
+        others = SHARE_OF_A_STEP * heldout * checks + STEPS_OF_A_BATCH * batches
+        looks = drawn / refine.thinning(self.target) ** 2 + others
         side = visibility.size / visibility.stride
         amounts = {
             "once": 1.0,
@@ -133,9 +134,9 @@ class Work:
             "view_pairs": visibility.views * side * math.sqrt(self.target),
             "view_values": float(visibility.views * self.target * self.colors),
             "images_in": float((0 if shared else heldout) + new_images) * self.count,
-            "looks": renders,
-            "look_pixels": renders * (refine.size / refine.stride) ** 2,
-            "looks_out": renders * self.target,
+            "looks": drawn + others,
+            "look_pixels": looks * (refine.size / refine.stride) ** 2,
+            "looks_out": (drawn + others) * self.target,
             "search": searched * math.log2(cells + 2),
             "pairs": float(cells if cells > self.target else 0),
         }

@@ -275,7 +275,8 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
             f"refinement off; found {options.refine:g} and {options.refine_steps}."
         )
     steps, seconds = options.refine_steps or 0, options.refine or 0.0
-    return {"refine.steps": str(steps), "refine.seconds": str(seconds)}
+    exact = {"refine.lengthening": "1"} if steps else {}
+    return {"refine.steps": str(steps), "refine.seconds": str(seconds), **exact}
 
 
 def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int | None:

@@ -1,6 +1,7 @@
 """The settings of each stage."""
 
-from typing import Annotated, Literal
+import math
+from typing import Annotated, Literal, Self
 
 import pydantic
 
@@ -9,6 +10,8 @@ from cvtgs.config.base import Section
 Share = Annotated[float, pydantic.Field(ge=0.0, le=1.0)]
 Rate = Annotated[float, pydantic.Field(ge=0.0)]
 Count = Annotated[int, pydantic.Field(ge=1)]
+
+_IN_STEPS = ("steps", "half_after", "check_every", "steps_per_image")  # settings of a refinement
 Ridge = Annotated[float, pydantic.Field(ge=1e-9, le=1e9)]  # products of two fit into float32
 Choice = Literal["auto", "on", "off"]
 Less = Literal["auto", "off"]
@@ -290,6 +293,11 @@ class RefineConfig(ImageSection):
         heldout: Number of held-out views, which decide what is kept and are never trained on.
         check_every: Steps between two checks of the held-out views.
         patience: Checks without a new best after which the refinement ends.
+        lengthening: Largest factor of the number of steps for few Gaussians, which are large and
+            need fewer pixels and more steps. If a square image has r * r pixels for each, and r is
+            at least 2, a step uses only every second pixel along rows and columns, and ``steps``,
+            ``half_after``, ``check_every`` and ``steps_per_image`` are r times as large. 1 for
+            never.
 
     Example:
         >>> RefineConfig(size=128).rates.means
@@ -312,6 +320,37 @@ class RefineConfig(ImageSection):
     heldout: Count = 8
     check_every: Count = 25
     patience: Count = 8
+    lengthening: float = pydantic.Field(default=1.0, ge=1.0, le=16.0)
+
+    def thinning(self, count: int) -> int:
+        """Return which pixels of an image a step uses.
+
+        Args:
+            count: Number of Gaussians.
+
+        Returns:
+            2 for every second one along rows and columns; 1 for all.
+        """
+        return 1 if self._times(count) == 1.0 else 2
+
+    def for_count(self, count: int) -> Self:
+        """Return the settings with as many steps as a number of Gaussians needs.
+
+        Args:
+            count: Number of Gaussians.
+
+        Returns:
+            The same settings, or more steps if these use fewer pixels.
+        """
+        times = self._times(count)
+        return self.model_copy(
+            update={name: round(times * getattr(self, name)) for name in _IN_STEPS}
+        )
+
+    def _times(self, count: int) -> float:
+        """Return the factor of the number of steps: 1, or at least 2."""
+        times = min(self.size / (self.stride * math.sqrt(count)), self.lengthening)
+        return times if times >= 2.0 else 1.0
 
     def new_images(self, steps: int, *, shared: int = 0) -> int:
         """Return the number of images of the full scene that some steps render, if available.

@@ -42,6 +42,7 @@ MATCHED: Mapping[str, Any] = {
         **IMAGES,
         "steps_per_image": 100,
         "check_every": 15,
+        "lengthening": 4.0,
     },
 }
 
@@ -62,6 +63,7 @@ THINNED: Mapping[str, Any] = {
     "first_images": 32,
     "steps_per_image": 1000,
     "check_every": 15,
+    "lengthening": 4.0,
 }
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {

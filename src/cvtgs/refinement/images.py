@@ -122,19 +122,26 @@ class ImageBuffer:
     """Training images: the first are new, later ones are new at intervals and reused in between.
 
     A reused image is drawn at random from the least recently used half of the buffer. A step sees
-    every ``config.stride``-th pixel, with a random first one.
+    every ``config.stride``-th pixel, with a random first one, and of these every ``thinning``-th,
+    as long as enough are left for SSIM.
 
     Memory: 8 bytes per pixel of at most ``config.images`` images, or of one image if all are new,
     and as much for the images of a step.
     """
 
     def __init__(
-        self, full: GaussianScene, views: RefineViews, *, config: RefineConfig, seed: int
+        self,
+        full: GaussianScene,
+        views: RefineViews,
+        *,
+        config: RefineConfig,
+        seed: int,
+        thinning: int = 1,
     ) -> None:
         always_new = views.endless and config.steps_per_image == 1
         self._full = full
         self._cameras = views.training
-        self._config = config
+        self._config, self._thinning = config, thinning
         self._capacity = max(1 if always_new else config.images, len(views.images))
         self._first = max(config.first_images, len(views.images))
         self._rng = random.Random(seed)
@@ -165,6 +172,8 @@ class ImageBuffer:
             self._kept.append((render_views(self._full, camera).half(), self._config.stride))
             self.rendered += 1
         image, stride = self._kept[-1]
+        most = min(image.rgb.shape[1:3]) // SSIM_WINDOW
+        stride = max(stride, min(stride * self._thinning, most))
         if stride == 1:
             return image
         first = (self._rng.randrange(stride), self._rng.randrange(stride))

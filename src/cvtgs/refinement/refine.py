@@ -108,6 +108,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     config = RefineConfig() if config is None else config
     if not isinstance(config, RefineConfig):
         raise InvalidArgumentError(f"config must be a RefineConfig, found {shown(config)}.")
+    thinning, config = config.thinning(len(small)), config.for_count(len(small))
     if seconds is None and steps is None:
         seconds = config.seconds or None
         steps = config.steps or (DEFAULT_STEPS if seconds is None else None)
@@ -151,7 +152,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
             images=views.heldout_images,
             backgrounds=(BLACK, WHITE),
         )
-        images = ImageBuffer(theirs, views, config=config, seed=seed)
+        images = ImageBuffer(theirs, views, config=config, seed=seed, thinning=thinning)
         scales = learning_rate_scales(ours, theirs)
         scales[:frozen] = 0.0
         valid = valid_rows(ours)
