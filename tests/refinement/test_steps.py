@@ -47,10 +47,10 @@ def test_backgrounds_are_random_and_seeded():
 
 
 @pytest.mark.parametrize(
-    ("count", "thinning", "times"), [(300, 1, 1), (256, 2, 2), (100, 2, 3.2), (9, 2, 4)]
+    ("count", "thinning", "times"), [(164, 1, 1), (163, 2, 2.506), (100, 2, 3.2), (9, 2, 4)]
 )
 def test_few_gaussians_get_more_steps_of_fewer_pixels(count, thinning, times):
-    """At 64 x 64 pixels, 256 Gaussians have 16 each, as many as 4 x 4, and half of 4 is 2."""
+    """Of 32 x 32 pixels, 163 Gaussians have 6.28 each, and 164 have 6.24, less than 2.5 * 2.5."""
     config = RefineConfig(size=64, stride=2, steps=10, lengthening=4, half_after=20, check_every=5)
     assert config.thinning(count) == thinning
     found = config.for_count(count)

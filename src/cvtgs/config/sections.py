@@ -11,6 +11,7 @@ Share = Annotated[float, pydantic.Field(ge=0.0, le=1.0)]
 Rate = Annotated[float, pydantic.Field(ge=0.0)]
 Count = Annotated[int, pydantic.Field(ge=1)]
 
+LEAST_LENGTHENING = 2.5  # with a smaller factor, steps on fewer pixels gain nothing
 _IN_STEPS = ("steps", "half_after", "check_every", "steps_per_image")  # settings of a refinement
 Ridge = Annotated[float, pydantic.Field(ge=1e-9, le=1e9)]  # products of two fit into float32
 Choice = Literal["auto", "on", "off"]
@@ -295,9 +296,9 @@ class RefineConfig(ImageSection):
         patience: Checks without a new best after which the refinement ends.
         lengthening: Largest factor of the number of steps for few Gaussians, which are large and
             need fewer pixels and more steps. If a square image has r * r pixels for each, and r is
-            at least 2, a step uses only every second pixel along rows and columns, and ``steps``,
-            ``half_after``, ``check_every`` and ``steps_per_image`` are r times as large. 1 for
-            never.
+            at least 2.5, a step uses only every second pixel along rows and columns, and
+            ``steps``, ``half_after``, ``check_every`` and ``steps_per_image`` are r times as large.
+            1 for never.
 
     Example:
         >>> RefineConfig(size=128).rates.means
@@ -348,9 +349,9 @@ class RefineConfig(ImageSection):
         )
 
     def _times(self, count: int) -> float:
-        """Return the factor of the number of steps: 1, or at least 2."""
+        """Return the factor of the number of steps: 1, or at least :data:`LEAST_LENGTHENING`."""
         times = min(self.size / (self.stride * math.sqrt(count)), self.lengthening)
-        return times if times >= 2.0 else 1.0
+        return times if times >= LEAST_LENGTHENING else 1.0
 
     def new_images(self, steps: int, *, shared: int = 0) -> int:
         """Return the number of images of the full scene that some steps render, if available.
