@@ -10,12 +10,12 @@ from cvtgs.config.base import Section
 Share = Annotated[float, pydantic.Field(ge=0.0, le=1.0)]
 Rate = Annotated[float, pydantic.Field(ge=0.0)]
 Count = Annotated[int, pydantic.Field(ge=1)]
-
-LEAST_LENGTHENING = 2.5  # with a smaller factor, steps on fewer pixels gain nothing
-_IN_STEPS = ("steps", "half_after", "check_every", "steps_per_image")  # settings of a refinement
 Ridge = Annotated[float, pydantic.Field(ge=1e-9, le=1e9)]  # products of two fit into float32
 Choice = Literal["auto", "on", "off"]
 Less = Literal["auto", "off"]
+
+LEAST_LENGTHENING = 2.5  # with a smaller factor, steps on fewer pixels gain nothing
+_IN_STEPS = ("steps", "half_after", "check_every", "steps_per_image")  # settings of a refinement
 
 
 def _degree_of_text(value: object) -> object:
