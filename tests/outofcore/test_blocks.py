@@ -226,7 +226,7 @@ def test_invalid_rows_are_dropped_and_flyaways_do_no_harm(tmp_path):
     logits[20] = torch.inf
     changed = scene.with_tensors({"means": means, "logit_opacities": logits}, {})
     cvtgs.save(changed, tmp_path / "in.ply")
-    with pytest.warns(UserWarning, match="dropped 1 of 2000"):
+    with pytest.warns(UserWarning, match="dropped 1 of 2,000"):
         report = simplify_file(tmp_path / "in.ply", tmp_path / "out.ply", 0.1, blocks=4)
     assert (report.output_count, report.invalid_count) == (200, 1)
     assert not cvtgs.validity.invalid_rows(cvtgs.load(tmp_path / "out.ply"))
