@@ -117,7 +117,7 @@ class Work:
         checks = 1 + math.ceil(refine.steps / refine.check_every)
         drawn = refine.steps * refine.images_per_step
         others = SHARE_OF_A_STEP * heldout * checks + STEPS_OF_A_BATCH * batches
-        looks = drawn / refine.thinning(self.target) ** 2 + others
+        looks, whole_images = drawn + others, drawn / refine.thinning(self.target) ** 2 + others
         side = visibility.size / visibility.stride
         amounts = {
             "once": 1.0,
@@ -134,9 +134,9 @@ class Work:
             "view_pairs": visibility.views * side * math.sqrt(self.target),
             "view_values": float(visibility.views * self.target * self.colors),
             "images_in": float((0 if shared else heldout) + new_images) * self.count,
-            "looks": drawn + others,
-            "look_pixels": looks * (refine.size / refine.stride) ** 2,
-            "looks_out": (drawn + others) * self.target,
+            "looks": looks,
+            "look_pixels": whole_images * (refine.size / refine.stride) ** 2,
+            "looks_out": looks * self.target,
             "search": searched * math.log2(cells + 2),
             "pairs": float(cells if cells > self.target else 0),
         }

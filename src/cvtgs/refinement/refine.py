@@ -75,7 +75,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         small: The simplified scene; it is not changed.
         full: The scene that it was made from.
         seconds: Largest wall-clock time, seconds.
-        steps: Largest number of steps; if neither is given, the configuration decides, else 500.
+        steps: Largest number of steps; if neither is given, the configuration decides, with more
+            for few Gaussians if ``config.lengthening`` says so, else 500.
         cameras: The views, at least 2; an eighth of them, from 1 to ``config.heldout``, is held
             out. None finds new views: automatic ones, and others from all around.
         config: All other settings; None for the defaults.
