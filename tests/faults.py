@@ -177,7 +177,11 @@ def kill(command: Command, folder: Path, seconds: float, name: str) -> int:
         return code
     if code not in (0, SIGNALS[name]) and not (code == 130 and not text):
         raise FaultError(f"status {code} after {name}: {text}")
-    sentences = [line for line in text.splitlines() if not line.startswith("cvtgs: warning: ")]
+    sentences = [
+        line
+        for line in text.splitlines()
+        if not line.startswith("cvtgs: warning: ") and " has the finished steps" not in line
+    ]
     if len(sentences) > 1:
         raise FaultError(f"more than one sentence after {name}: {text}")
     return code
