@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.analysis import ambient_visibility
@@ -32,9 +32,11 @@ _LARGEST = 1e18
 
 THINNEST = 0.1  # axes below this share of the mean axis count as this thick, as in images
 MOST_CONCENTRATED = 0.75  # so a changed Gaussian that represents only one other moves at a quarter
+LARGE = 2.0  # times the upper quartile of sizes; Gaussians beyond it move less
 MARKING = ("log_scales", "logit_opacities", "sh0")  # what tells Gaussians at one position apart
 _BETAS = (0.6, 0.99)
 
+WEAK = 0.01  # gradients below this share of their root mean square cause shorter steps
 _LEAST_ROOT = 1e-15
 
 
@@ -189,9 +191,10 @@ class SceneOptimizer:
     """A scene as initial values plus changes, and the optimizer of the changes.
 
     A step of Adam (Kingma and Ba 2015) moves only the Gaussians that an image shows: all others
-    have no gradient, keep their momentum, and stay unchanged. ``torch.optim.SparseAdam`` does the
-    same, but any torch optimizer first imports the torch compiler, which takes a second.
-    Memory: five times the scene.
+    have no gradient, keep their momentum, and stay unchanged. Each has its own count of steps in
+    the correction of bias, without which those that are rarely shown would move up to four times
+    as far in a step. Its epsilon is a share of the root mean square of all gradients, so that what
+    images hardly show moves little. Memory: five times the scene.
     """
 
     def __init__(
@@ -210,10 +213,12 @@ class SceneOptimizer:
         }
         # All changes are columns of one tensor, which takes far fewer operations.
         self._widths = [self._start[name][0].numel() for name in self._rates]
+        pairs = zip(self._rates.values(), self._widths, strict=True)
+        self._column_rates = scene.means.new_tensor([r for r, width in pairs for _ in range(width)])
         self._changes = scene.means.new_zeros(len(scene), sum(self._widths), requires_grad=True)
         self._moved = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
         self._moments = torch.zeros_like(self._changes), torch.zeros_like(self._changes)
-        self._steps = 0
+        self._counts = scene.means.new_zeros(len(scene), 1)  # steps of each Gaussian
 
     def scene(self) -> GaussianScene:
         """Return the scene, differentiable in the changes."""
@@ -234,23 +239,19 @@ class SceneOptimizer:
             return
         (gradient,) = torch.autograd.grad(loss, [self._changes], materialize_grads=True)
         rows = ((gradient != 0).any(dim=1) & gradient.isfinite().all(dim=1)).nonzero()[:, 0]
-        self._steps += 1
-        biases = [1 - beta**self._steps for beta in _BETAS]
-        scale = factor * math.sqrt(biases[1]) / biases[0]
-        lengths = [
-            scale * rate
-            for rate, width in zip(self._rates.values(), self._widths, strict=True)
-            for _ in range(width)
-        ]
+        counts = self._counts.index_select(0, rows).add_(1)
+        self._counts.index_copy_(0, rows, counts)
         largest = 0.5 * torch.finfo(gradient.dtype).max ** 0.5  # its square must not overflow
         some = gradient.index_select(0, rows).clamp_(-largest, largest)
         means, squares = (
             _moved_average(values, rows, new, beta)
             for values, new, beta in zip(self._moments, (some, some.square()), _BETAS, strict=True)
         )
-        steps = torch.tensor(lengths, dtype=gradient.dtype, device="cpu").neg_()
-        steps = steps.to(gradient.device, non_blocking=True)
-        change = means.div_(squares.sqrt_().add_(_LEAST_ROOT)).mul_(steps)
+        common = self._moments[1].mean(dim=0, dtype=torch.float64).sqrt_().to(gradient.dtype)
+        roots = squares.sqrt_().add_(WEAK * common).add_(_LEAST_ROOT)
+        biases = [1 - beta**counts for beta in _BETAS]
+        lengths = biases[1].sqrt_().div_(biases[0]).mul_(-factor)
+        change = means.div_(roots).mul_(lengths).mul_(self._column_rates)
         values = self._changes.detach()
         values.index_copy_(0, rows, change.add_(values.index_select(0, rows)))
         self._moved[rows] = True
@@ -307,15 +308,27 @@ def learning_rate_scales(small: GaussianScene, full: GaussianScene) -> Float[Ten
 
     Enclosed Gaussians (:func:`cvtgs.analysis.ambient_visibility`) move less, because they may be
     all that other views see. So do Gaussians that represent few others: they are nearly right in
-    every view, and long steps towards a few images would lose more in all others. Invalid rows do
-    not move.
+    every view, and long steps towards a few images would lose more in all others. So do those that
+    are large for the scene, mostly fog: a change of one fills the images of cameras within it, and
+    other cameras hardly show it. Invalid rows do not move.
     """
     valid = valid_rows(small)
     some = small.select(valid)
     visibility = ambient_visibility(some.means, some.masses, robust_frame(some.means))
+    free = visibility * (1.0 - _concentrations(some, full))
     scales = torch.zeros_like(small.logit_opacities)
-    scales[valid] = (visibility * (1.0 - _concentrations(some, full))).to(small.dtype)
+    scales[valid] = (free * _size_factors(some, free > 0.0)).to(small.dtype)
     return scales
+
+
+def _size_factors(scene: GaussianScene, movable: Bool[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Return 1, or less for a Gaussian beyond :data:`LARGE` times the upper quartile of sizes."""
+    sizes = scene.log_scales.double().amax(dim=1).clamp_min(-1e3)  # infinities have no differences
+    some = sizes[movable]
+    if len(some) == 0:
+        return torch.ones_like(sizes)
+    limit = math.log(LARGE) + some.kthvalue(-(-3 * len(some) // 4)).values
+    return (limit - sizes).clamp_max(0.0).exp()
 
 
 def _concentrations(small: GaussianScene, full: GaussianScene) -> Float[Tensor, "n"]:
