@@ -194,7 +194,8 @@ class SceneOptimizer:
     have no gradient, keep their momentum, and stay unchanged. Each has its own count of steps in
     the correction of bias, without which those that are rarely shown would move up to four times
     as far in a step. Its epsilon is a share of the root mean square of all gradients, so that what
-    images hardly show moves little. Memory: five times the scene.
+    images hardly show moves little. ``torch.optim.SparseAdam`` has neither, and any torch optimizer
+    first imports the torch compiler, which takes a second. Memory: five times the scene.
     """
 
     def __init__(
