@@ -1,4 +1,4 @@
-"""The steps of a refinement: the learning rate scale of each Gaussian, and finite steps."""
+"""The steps of a refinement: the learning-rate scale of each Gaussian, and how far it moves."""
 
 import math
 

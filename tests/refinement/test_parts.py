@@ -1,4 +1,4 @@
-"""The parts of refinement: limits, views, images, the optimizer."""
+"""The parts of refinement: limits, scores, views, images, settings."""
 
 import weakref
 from itertools import chain
