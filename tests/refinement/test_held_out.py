@@ -1,6 +1,7 @@
 """Held-out images: which they are, their size, and how they decide; what a step compares."""
 
 from dataclasses import replace
+from itertools import chain, repeat
 
 import pytest
 import torch
@@ -89,7 +90,7 @@ def optimized(small, full, config, *, cameras, steps):
 )
 def test_a_far_better_view_counts_as_ten_decibels_above_the_median(monkeypatch, later, after):
     """At first 20 dB in three views and 50 in the last, which counts as 30: 22.5 on average."""
-    scores = iter([(20, 50), later])
+    scores = chain([(20, 50)], repeat(later))  # also for parts of the changes
 
     def scored(*_) -> torch.Tensor:
         usual, last = next(scores)
@@ -101,6 +102,44 @@ def test_a_far_better_view_counts_as_ten_decibels_above_the_median(monkeypatch, 
     found = optimized(small, full, config, cameras=1, steps=1)
     assert (found.before, found.after) == (22.5, after)
     assert (found.scene is small) == (after == 22.5)
+
+
+@pytest.mark.parametrize(
+    ("later", "part"),
+    [((21,), 1.0), ((19, 20.5), 0.75), ((19, 20, 21), 0.5), ((19, 19, 20, 20.1), 0.25)],
+)
+def test_the_largest_part_of_refused_changes_that_gains_is_kept(monkeypatch, later, part):
+    """Scores of the start, after the step, and of three quarters, half and a quarter of it."""
+    scores = iter([20, *later])
+    monkeypatch.setattr(optimize, "heldout_psnr", lambda *_: torch.tensor([float(next(scores))]))
+    full, config = full_scene(50), quick()
+    small = discolored(full)
+    found = optimized(small, full, config, cameras=1, steps=1)
+    assert next(scores, None) is None
+    assert found.after == pytest.approx(later[-1])
+    monkeypatch.setattr(optimize, "heldout_psnr", lambda *_: torch.tensor([20.0 + next(whole)]))
+    whole = iter(range(2))
+    changes = optimized(small, full, config, cameras=1, steps=1).scene.sh0 - small.sh0
+    assert changes.abs().amax() > 0
+    torch.testing.assert_close(found.scene.sh0 - small.sh0, part * changes, atol=1e-6, rtol=1e-4)
+
+
+def test_without_a_part_that_gains_the_start_is_kept(monkeypatch):
+    scores = iter([20.0, 19.0, 19.0, 20.0, 20.0])
+    monkeypatch.setattr(optimize, "heldout_psnr", lambda *_: torch.tensor([next(scores)]))
+    full, config = full_scene(50), quick()
+    small = discolored(full)
+    assert optimized(small, full, config, cameras=1, steps=1).scene is small
+    assert next(scores, None) is None
+
+
+def test_no_part_is_tried_when_the_time_is_over(monkeypatch):
+    scores = iter([20.0, 19.0])
+    monkeypatch.setattr(optimize, "heldout_psnr", lambda *_: torch.tensor([next(scores)]))
+    monkeypatch.setattr(Limits, "reached", lambda limits: "time" if limits.steps else "")
+    full, config = full_scene(50), quick()
+    small = discolored(full)
+    assert optimized(small, full, config, cameras=1, steps=1).scene is small
 
 
 def test_an_equal_scene_looks_equal_over_every_background(monkeypatch):

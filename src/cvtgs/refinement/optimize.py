@@ -39,6 +39,8 @@ _BETAS = (0.6, 0.99)
 WEAK = 0.01  # gradients below this share of their root mean square cause shorter steps
 _LEAST_ROOT = 1e-15
 
+PARTS = 0.75, 0.5, 0.25  # shares of the changes to try if held-out images refuse all of them
+
 
 class Limits:
     """Counters of steps and seconds, which decide whether one more step fits."""
@@ -145,6 +147,14 @@ def optimize(
                 stopped = "patience" if is_stuck else limits.reached()
         note = f"{after - before:+.2f} dB"
         listener(ProgressEvent(stage=STAGE, done=limits.done, total=limits.total, note=note))
+    # Steps that fit their images too closely still point the right way, and lead too far.
+    for part in PARTS if limits.steps and stopped != "time" else ():
+        if after > before:
+            break
+        scene = optimizer.result(part=part)
+        score = float(heldout_psnr(scene, scorer).clamp(max=cap).mean())
+        if score > before:
+            best, after = scene, score
     return Optimized(scene=best, before=before, after=after, stopped=stopped)
 
 
@@ -221,11 +231,12 @@ class SceneOptimizer:
         self._moments = torch.zeros_like(self._changes), torch.zeros_like(self._changes)
         self._counts = scene.means.new_zeros(len(scene), 1)  # steps of each Gaussian
 
-    def scene(self) -> GaussianScene:
-        """Return the scene, differentiable in the changes."""
+    def scene(self, *, part: float = 1.0) -> GaussianScene:
+        """Return the scene after some part of the changes, differentiable in them."""
+        changes = self._changes if part == 1.0 else part * self._changes
         shifts = {
             name: change.view(self._start[name].shape) * self._units[name]
-            for name, change in zip(self._rates, self._changes.split(self._widths, 1), strict=True)
+            for name, change in zip(self._rates, changes.split(self._widths, 1), strict=True)
         }
         if "means" in shifts:
             shifts["means"] = (self._frames @ shifts["means"][:, :, None])[:, :, 0]
@@ -258,9 +269,9 @@ class SceneOptimizer:
         self._moved[rows] = True
 
     @torch.no_grad()
-    def result(self) -> GaussianScene:
-        """Return the scene as it would be saved."""
-        current = self.scene()
+    def result(self, *, part: float = 1.0) -> GaussianScene:
+        """Return the scene as it would be saved, after some part of the changes."""
+        current = self.scene(part=part)
         moved, now = self._moved & valid_rows(current), standardized(current)
         tensors = {
             name: torch.where(_like(moved, old), now.tensors()[name], old)

@@ -58,10 +58,11 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
 
     Each step uses ``config.images_per_step`` images of the full scene, each over a random
     background; Adam moves the Gaussians that they show. The scene of highest PSNR on held-out views
-    is returned, or the input scene if none is better. Number of Gaussians, SH degree, comments,
-    layout and extra columns are kept. Gaussians that no image shows stay bit for bit, as do those
-    that represent only themselves, and invalid rows, which are not drawn. About every third image
-    of a scene tagged mip ignores the tag, as many viewers do.
+    is returned. If none is better than the input, three quarters, a half and a quarter of the
+    changes are tried, and the first that is better is returned, or the input scene. Number of
+    Gaussians, SH degree, comments, layout and extra columns are kept. Gaussians that no image shows
+    stay bit for bit, as do those that represent only themselves, and invalid rows, which are not
+    drawn. About every third image of a scene tagged mip ignores the tag, as many viewers do.
 
     The same scenes, steps, configuration and seed give the same bits on a CPU; with ``seconds``
     the number of steps depends on the clock. The time includes everything, even the compilation
