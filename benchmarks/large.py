@@ -1,7 +1,9 @@
 """Measure levels of detail, and out-of-core runs on large files.
 
 ``python -m benchmarks.large levels`` compares the time of levels with that of separate runs;
-``seams`` compares runs by blocks with runs in one piece; ``blocks`` simplifies a large generated
+``seams`` compares runs by blocks with runs in one piece, by the cameras beside a file where it has
+some (``benchmarks.cameras``); ``--fit 48`` gives presets with images that many others, and
+``--exact`` takes the ratio alone instead of five around it. ``blocks`` simplifies a large generated
 file in its own process and prints its user CPU seconds and peak memory. With ``--workers 1 2`` it
 also prints the speedup of two workers on two cores over one on one, and whether both write the
 same bytes. Tables are Markdown.
@@ -14,14 +16,17 @@ import json
 import os
 import tempfile
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import mean, median
 
 import torch
 
 import cvtgs
+from benchmarks.cameras import cameras_beside, cameras_file, spread_cameras
 from benchmarks.measuring import cores, machine, run_python
 from benchmarks.quality import score_views
+from cvtgs.cameras import Cameras
 from cvtgs.outofcore import simplify_file
 from cvtgs.outofcore.memory import read_bytes
 from cvtgs.views import automatic_views
@@ -39,6 +44,8 @@ def main() -> None:
     parser.add_argument("--kinds", default=kinds, help="kinds of generated scenes")
     parser.add_argument("--blocks", default="4,16", help="numbers of blocks to compare")
     parser.add_argument("--presets", default="standard", help="presets to compare by blocks")
+    parser.add_argument("--fit", type=int, default=0, help="number of cameras to give to presets")
+    parser.add_argument("--exact", action="store_true", help="compare at the ratio alone")
     parser.add_argument(
         "--memory",
         default="2GB",
@@ -87,28 +94,38 @@ def levels(options: argparse.Namespace) -> None:
 
 
 def seams(options: argparse.Namespace) -> None:
-    """Print PSNR of runs by blocks against runs in one piece, as means over several counts.
+    """Print scores of runs by blocks against runs in one piece, as means over several counts.
 
     Changing the count by one per cent changes a single figure by more than seams do.
     """
     numbers = [1, *(int(word) for word in options.blocks.split(","))]
-    columns = f"| scene, rho {options.rho:g} | preset | one piece |"
+    shares = (1.0,) if options.exact else SHARES
+    columns = f"| scene, rho {options.rho:g} | preset | one piece, dB (SSIM) |"
     print(columns, *(f"{n} blocks |" for n in numbers[1:]))
     print("|---|---|---|" + "---|" * len(numbers[1:]))
-    for (name, scene), preset in itertools.product(scenes(options), options.presets.split(",")):
-        small, simplifier = {}, cvtgs.Simplifier(preset=preset, device="cpu")
+    for (name, scene, cameras), preset in itertools.product(
+        seen_scenes(options), options.presets.split(",")
+    ):
+        given = spread_cameras(scene, options.fit) if options.fit else None
+        simplifier = cvtgs.Simplifier(preset=preset, device="cpu")
+        found: dict[int, list[cvtgs.GaussianScene]] = {number: [] for number in numbers}
         with tempfile.TemporaryDirectory() as folder:
             path, output = Path(folder) / "in.ply", Path(folder) / "out.ply"
             cvtgs.save(scene, path)
-            for number, share in itertools.product(numbers, SHARES):
+            for number, share in itertools.product(numbers, shares):
                 rho = share * options.rho
+                if number == 1:
+                    found[number].append(simplifier.simplify(scene, rho, cameras=given))
+                    continue
                 simplify_file(
-                    path, output, rho, blocks=number, simplifier=simplifier, overwrite=True
-                )
-                small[f"{number} {share}"] = cvtgs.load(output)
-        psnr = scores(scene, small)
-        means = [mean(psnr[f"{n} {share}"] for share in SHARES) for n in numbers]
-        words = [f"{means[0]:.2f} |", *(f"{value - means[0]:+.2f} |" for value in means[1:])]
+                    path, output, rho, blocks=number, simplifier=simplifier, cameras=given,
+                    overwrite=True,
+                )  # fmt: skip
+                found[number].append(cvtgs.load(output))
+        psnr, ssim = zip(*(scores(scene, found[n], cameras) for n in numbers), strict=True)
+        words = [f"{psnr[0]:.2f} ({ssim[0]:.4f}) |"]
+        for one, other in zip(psnr[1:], ssim[1:], strict=True):
+            words.append(f"{one - psnr[0]:+.2f} ({other - ssim[0]:+.4f}) |")
         print(f"| {name}, {len(scene):,} | {preset} |", *words, flush=True)
 
 
@@ -154,10 +171,25 @@ def scenes(options: argparse.Namespace) -> list[tuple[str, cvtgs.GaussianScene]]
     return [(kind, make_one(kind, options.count, sh_degree=1, seed=3)) for kind in kinds]
 
 
-def scores(scene: cvtgs.GaussianScene, small: dict[str, cvtgs.GaussianScene]) -> dict[str, float]:
-    """Return the mean PSNR over automatic views, by name."""
-    cameras = automatic_views(scene, 6, width=400, height=300)
-    return {name: found.psnr for name, found in score_views(scene, small, cameras).items()}
+def seen_scenes(
+    options: argparse.Namespace,
+) -> Iterator[tuple[str, cvtgs.GaussianScene, Cameras]]:
+    """Yield the scenes with the cameras beside them; automatic views where there are none."""
+    beside = {file.stem: file for file in options.files if cameras_file(file).is_file()}
+    for name, scene in scenes(options):
+        if name in beside:
+            yield name, scene, cameras_beside(beside[name])
+        else:
+            yield name, scene, automatic_views(scene, 6, width=400, height=300)
+
+
+def scores(
+    scene: cvtgs.GaussianScene, small: Sequence[cvtgs.GaussianScene], cameras: Cameras
+) -> tuple[float, float]:
+    """Return the mean PSNR and SSIM of several simplified scenes."""
+    named = {str(number): one for number, one in enumerate(small)}
+    found = score_views(scene, named, cameras).values()
+    return mean(one.psnr for one in found), mean(one.ssim for one in found)
 
 
 if __name__ == "__main__":

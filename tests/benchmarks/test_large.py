@@ -1,10 +1,13 @@
-"""Large files in blocks: the table of workers."""
+"""Large files in blocks: the tables of workers and of seams."""
 
 import json
 import sys
 from pathlib import Path
 
-from benchmarks import large
+import pytest
+
+import cvtgs
+from benchmarks import cameras, large
 from benchmarks.measuring import Cost
 
 
@@ -32,3 +35,33 @@ def test_workers_are_compared(tmp_path, monkeypatch, capsys):
         f"{start} 2 | 1.0 | 4.0 | 2.00, same bytes {end}",
         f"{start} 3 | 1.0 | 2.7 | 3.00, DIFFERENT bytes {end}",
     ]
+
+
+@pytest.mark.parametrize("has_cameras", [True, False])
+def test_seams_are_scored_by_the_cameras_beside_a_file(tmp_path, monkeypatch, capsys, has_cameras):
+    """And the others, six of which are given, score nothing."""
+    scene = cvtgs.synthetic.scene("object", 300, sh_degree=0, seed=0)
+    file, calls, seen = tmp_path / "a.ply", [], []
+    cvtgs.save(scene, file)
+    if has_cameras:
+        cameras.main([str(file)])
+
+    def simplify(_, output, rho: float, **options) -> None:
+        calls.append((rho, options["blocks"], len(options["cameras"])))
+        cvtgs.save(scene[:30], output, overwrite=True)
+
+    def noted(full, small, views) -> dict:
+        seen.append(len(views))
+        return score_views(full, small, views)
+
+    score_views = large.score_views
+    monkeypatch.setattr(large, "simplify_file", simplify)
+    monkeypatch.setattr(large, "score_views", noted)
+    words = ["large", "seams", str(file), "--exact", "--fit", "6", "--blocks", "2", "--rho", "0.2"]
+    monkeypatch.setattr(sys, "argv", words)
+    large.main()
+    assert calls == [(0.2, 2, 6)]
+    assert seen == [12 if has_cameras else 6] * 2
+    name, preset, whole, blocks = capsys.readouterr().out.splitlines()[-1].strip("| ").split(" | ")
+    assert (name, preset) == ("a, 300", "standard")
+    assert float(whole.split()[0]) > 0 > float(blocks.split()[0])
