@@ -147,14 +147,14 @@ def optimize(
                 stopped = "patience" if is_stuck else limits.reached()
         note = f"{after - before:+.2f} dB"
         listener(ProgressEvent(stage=STAGE, done=limits.done, total=limits.total, note=note))
-    # Steps that fit their images too closely still point the right way, and lead too far.
-    for part in PARTS if limits.steps and stopped != "time" else ():
-        if after > before:
-            break
-        scene = optimizer.result(part=part)
-        score = float(heldout_psnr(scene, scorer).clamp(max=cap).mean())
-        if score > before:
-            best, after = scene, score
+    if after == before and limits.steps and stopped != "time":
+        # Steps that fit their images too closely still point the right way, and lead too far.
+        for part in PARTS:
+            scene = optimizer.result(part=part)
+            score = float(heldout_psnr(scene, scorer).clamp(max=cap).mean())
+            if score > before:
+                best, after = scene, score
+                break
     return Optimized(scene=best, before=before, after=after, stopped=stopped)
 
 
