@@ -91,6 +91,58 @@ def test_contributions_are_measured_with_given_cameras(scene, tmp_path):
     assert found["pixels"] == pytest.approx(float(pixels), rel=0.05)
 
 
+@pytest.mark.slow
+def test_blocks_have_more_cells_where_images_err_only_with_given_cameras(scene, source, tmp_path):
+    errors, files = {}, {}
+    for power in (0.0, 1.0):
+        settings = MATCHED | {"match": {"color_iterations": 0, "error_power": power}}
+        for name, given in (("own", None), ("given", ring(10, width=48, height=48))):
+            path = tmp_path / f"{name}_{power:g}.ply"
+            report = in_blocks(source, path, settings, cameras=given)
+            assert report.output_count == len(cvtgs.load(path)) == 150
+            files[name, power] = path.read_bytes()
+            errors[name, power] = squared_error(scene, cvtgs.load(path), ring(5))
+    assert files["own", 0.0] == files["own", 1.0]
+    assert errors["given", 1.0] < 0.97 * errors["given", 0.0]
+
+
+def test_every_member_of_a_block_is_in_a_cell_again(source, tmp_path, monkeypatch):
+    found, reduce_rows = [], images.reduce_rows
+
+    def noting(job, rows, target, *, importance):
+        scene, reduced = reduce_rows(job, rows, target, importance=importance)
+        found.append((len(rows.scene), target, importance, reduced))
+        return scene, reduced
+
+    monkeypatch.setattr(images, "reduce_rows", noting)
+    report = in_blocks(source, tmp_path / "out.ply", MATCHED, cameras=ring(10))
+    assert sum(target for _, target, _, _ in found) == 150
+    assert [len(reduced.scene) for *_, reduced in found] == [target for _, target, *_ in found]
+    for count, _, importance, reduced in found:
+        assert reduced.partition.order.sort().values.tolist() == list(range(count))
+        assert importance.shape == (count,)
+        assert importance.min() < 1.0 < importance.max()
+    largest = max(int(reduced.partition.counts.amax()) for *_, reduced in found)
+    singles = sum(reduced.statistics.single_member_cells for *_, reduced in found)
+    assert (report.largest_cell, report.single_member_cells) == (largest, singles)
+
+
+def test_a_block_that_images_do_not_show_keeps_its_cells(source, tmp_path, monkeypatch):
+    """Its first result is matched then."""
+    observe = images.observe
+
+    def nothing(*arguments):
+        views = observe(*arguments)
+        return replace(views, contributions=torch.zeros_like(views.contributions))
+
+    def never(*_, **__):
+        raise AssertionError
+
+    monkeypatch.setattr(images, "observe", nothing)
+    monkeypatch.setattr(images, "reduce_rows", never)
+    assert in_blocks(source, tmp_path / "out.ply", MATCHED, cameras=ring(10)).output_count == 150
+
+
 def test_a_block_takes_the_cameras_that_show_it(scene):
     """Of ten cameras, five look at the block, one from far away, and four elsewhere."""
     beside = scene.with_tensors({"means": scene.means + torch.tensor([100.0, 0, 0])})

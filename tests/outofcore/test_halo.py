@@ -239,7 +239,8 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
         some, own = Moments(*take_columns(rows, *members)), merged[labels][rows]
         final.append(cells.reassign(some, own, wanted, near, config, must_stay=must_stay))
         start += len(part)
-    sizes = torch.cat([read_cells(job, block)[3].counts for block in job.blocks_with_cells()])
+    found = [read_cells(job, block) for block in job.blocks_with_cells()]
+    sizes = torch.cat([one.partition.counts for one in found])
     wanted_sizes = torch.bincount(torch.cat(final), minlength=TARGET)
     assert torch.equal(sizes.sort().values, wanted_sizes.sort().values)
     one_piece = cells.reassign(members, merged[labels], wanted, near, config)

@@ -27,14 +27,15 @@ from cvtgs.boxes import inside
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
 from cvtgs.devices import one_thread
+from cvtgs.grouping import importance_by_errors
 from cvtgs.io import load
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.matching import cell_contributions, match_views
 from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.merge import BlockCells, read_cells, read_report, write_block
+from cvtgs.outofcore.merge import BlockCells, read_cells, read_report, reduce_rows, write_block
 from cvtgs.outofcore.rows import BlockRows, kept_rows, read_rows
 from cvtgs.refinement import refine
-from cvtgs.rendering import contributions, observe
+from cvtgs.rendering import ObservedViews, contributions, error_shares, observe
 from cvtgs.report import MatchReport, RefineReport
 from cvtgs.scene import GaussianScene, concatenate
 from cvtgs.views import find_view_positions, mixed_views
@@ -142,9 +143,14 @@ def improve(job: Job, block: int) -> None:
     own, found, config = load(job.small_path(block)), read_cells(job, block), job.config
     drawn = _draw(job, block, own, found)
     views, later = _choose_views(job, drawn)
-    small, changes, observed = drawn.small, dict[str, Any](), None
+    changes, observed = dict[str, Any](), None
     if views is not None:
         observed = observe(drawn.full, views)
+        if job.cameras is not None and config.match.error_power > 0.0:
+            own, found, changes = _allocate_again(job, drawn, own, found, observed)
+            drawn = _draw(job, block, own, found)
+    small = drawn.small
+    if observed is not None:
         targets = cell_contributions(observed.contributions[drawn.fixed :], found.partition)
         small, changes["matching"] = match_views(
             small,
@@ -169,6 +175,42 @@ def improve(job: Job, block: int) -> None:
     changes["mass_out"] = float(improved.masses.sum())
     report = read_report(job, block).model_copy(update=changes)
     write_block(job, block, improved, report, is_improved=True)
+
+
+def _allocate_again(
+    job: Job, drawn: Drawn, own: GaussianScene, found: BlockCells, observed: ObservedViews
+) -> tuple[GaussianScene, BlockCells, dict[str, Any]]:
+    """Group the members of a block again, with fewer merges where its first result errs.
+
+    As in one piece, where cameras are given. New cells stay within the block, so each block can do
+    this alone. Also return what changes in its report.
+    """
+    scene, pixels = found.scene, observed.contributions[drawn.fixed :]
+    if len(own) == len(scene) or not bool(pixels.any()):
+        return own, found, {}
+    importance = importance_by_errors(
+        drawn.small[drawn.fixed :],
+        found.partition,
+        errors=error_shares(drawn.small, observed)[drawn.fixed :],
+        pixels=cell_contributions(pixels, found.partition),
+        count=len(scene),
+        power=job.config.match.error_power,
+    )
+    areas = measured_areas(
+        found.apparent_areas,
+        scene.opacities,
+        pixels,
+        mass_per_pixel=(found.apparent_areas * scene.opacities).sum() / pixels.sum(),
+        share=job.config.visibility.mass_share,
+    )
+    rows = BlockRows(found.original, areas, found.visibility)
+    _, reduced = reduce_rows(job, rows, len(own), importance=importance)
+    if reduced.partition is None:
+        return own, found, {}
+    again = restore_columns(reduced.scene, found.original, job.read_scan().plan)
+    names = ("single_member_cells", "largest_cell")
+    changes = {name: getattr(reduced.statistics, name) for name in names}
+    return again, found._replace(partition=reduced.partition), changes
 
 
 def _choose_views(job: Job, drawn: Drawn) -> tuple[Cameras | None, Cameras | None]:

@@ -19,8 +19,8 @@ from cvtgs.io.tensors import add_prefix, under_prefix
 from cvtgs.mergenet import correct_cells
 from cvtgs.outofcore.halo import bounding_box, halo_cells, other_blocks
 from cvtgs.outofcore.job import Job, Step
-from cvtgs.outofcore.rows import analysis_of, read_members, read_rows
-from cvtgs.pipeline import merge_members, neighbor_count, reduce_scene, shape_merged
+from cvtgs.outofcore.rows import BlockRows, analysis_of, read_members, read_rows
+from cvtgs.pipeline import Reduced, merge_members, neighbor_count, reduce_scene, shape_merged
 from cvtgs.progress import silent
 from cvtgs.report import CellStatistics, MatchReport, RefineReport
 from cvtgs.scene import GaussianScene
@@ -42,6 +42,7 @@ class BlockCells(NamedTuple):
 
     original: GaussianScene
     scene: GaussianScene
+    apparent_areas: Float[Tensor, "n"]
     visibility: Float[Tensor, "n"]
     partition: cells.Partition
 
@@ -51,7 +52,8 @@ def merge(job: Job, block: int) -> None:
     """Merge the members of every cell of a block."""
     if job.has("merged", block):
         return
-    _, scene, _, partition = read_cells(job, block)
+    found = read_cells(job, block)
+    scene, partition = found.scene, found.partition
     merged, shown = merge_members(scene, partition, job.config.merge, areas=scene.areas)
     first = shown.order[shown.offsets[:-1]]
     more = {
@@ -94,7 +96,7 @@ def correct(job: Job, block: int) -> None:
     """Correct the cells of a block with the network, if there is one, and write the block."""
     if job.small_path(block).exists():
         return
-    original, scene, visibility, partition = read_cells(job, block)
+    original, scene, _, visibility, partition = read_cells(job, block)
     own = job.read("inflated", block)
     shown = partition.keep_only(own["representatives"])
     small, sizes = _with_halo(job, "inflated", block, own["remote"])
@@ -128,16 +130,8 @@ def simplify_block(job: Job, block: int) -> None:
     """Simplify the only block of a job like a scene in memory, and write it."""
     if job.small_path(block).exists():
         return
-    scan = job.read_scan()
-    rows = read_rows(job, block)
-    scene = select_columns(rows.scene, job.config.effects)
-    analysis = analysis_of(scan, rows)
-    no_filter = {"min_opacity": 0.0, "max_flyaway_share": 0.0}  # the sort filtered the rows
-    filter_config = job.config.filter.model_copy(update=no_filter)
-    config = job.config.model_copy(update={"filter": filter_config})
-    net = job.read_network(scene.dtype)
-    clock = StageClock(silent, scene.device)
-    reduced = reduce_scene(scene, analysis, job.targets[block], config, net=net, clock=clock)
+    rows, scan = read_rows(job, block), job.read_scan()
+    scene, reduced = reduce_rows(job, rows, job.targets[block])
     report = BlockReport(
         input_count=len(scene),
         mass_out=float(reduced.scene.masses.sum()),
@@ -146,13 +140,35 @@ def simplify_block(job: Job, block: int) -> None:
     write_block(job, block, restore_columns(reduced.scene, rows.scene, scan.plan), report)
 
 
+def reduce_rows(
+    job: Job, rows: BlockRows, target: int, *, importance: Float[Tensor, "n"] | None = None
+) -> tuple[GaussianScene, Reduced]:
+    """Simplify rows like a scene of their own; also return the columns of them that are used.
+
+    ``importance`` is that of :func:`cvtgs.pipeline.reduce_scene`. The sort has filtered the rows.
+    """
+    scene = select_columns(rows.scene, job.config.effects)
+    no_filter = {"min_opacity": 0.0, "max_flyaway_share": 0.0}
+    filter_config = job.config.filter.model_copy(update=no_filter)
+    reduced = reduce_scene(
+        scene,
+        analysis_of(job.read_scan(), rows._replace(scene=scene)),
+        target,
+        job.config.model_copy(update={"filter": filter_config}),
+        net=job.read_network(scene.dtype),
+        clock=StageClock(silent, scene.device),
+        importance=importance,
+    )
+    return scene, reduced
+
+
 def read_cells(job: Job, block: int) -> BlockCells:
     """Read the Gaussians in the cells of a block."""
     rows, labels = read_members(job, block)
     used = select_columns(rows.scene, job.config.effects)
     scene = drop_unused_bands(used, job.read_scan().plan)
     partition = cells.Partition.from_labels(labels, job.targets[block])
-    return BlockCells(rows.scene, scene, rows.visibility, partition)
+    return BlockCells(rows.scene, scene, rows.apparent_areas, rows.visibility, partition)
 
 
 def _with_halo(
