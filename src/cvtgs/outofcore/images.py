@@ -6,7 +6,8 @@ stands for the others.
 
 Finished blocks are matched and refined one by one. In images of the full scene, only the block
 itself shows all of its Gaussians; the other blocks show their simplified ones, fixed and the same
-as in images of the small scene. Only the block differs.
+as in images of the small scene. Only the block differs. With given cameras, its Gaussians are first
+grouped again, with more cells where the images err.
 """
 
 import json
@@ -180,10 +181,10 @@ def improve(job: Job, block: int) -> None:
 def _allocate_again(
     job: Job, drawn: Drawn, own: GaussianScene, found: BlockCells, observed: ObservedViews
 ) -> tuple[GaussianScene, BlockCells, dict[str, Any]]:
-    """Group the members of a block again, with fewer merges where its first result errs.
+    """Group the members of a block into cells again, with more of them where its images err.
 
-    As in one piece, where cameras are given. New cells stay within the block, so each block can do
-    this alone. Also return what changes in its report.
+    This is what a run in one piece does with given cameras. The new cells stay within the block, so
+    blocks do not wait for each other. Also return what changes in its report.
     """
     scene, pixels = found.scene, observed.contributions[drawn.fixed :]
     if len(own) == len(scene) or not bool(pixels.any()):
