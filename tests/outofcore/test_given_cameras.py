@@ -127,6 +127,30 @@ def test_every_member_of_a_block_is_in_a_cell_again(source, tmp_path, monkeypatc
     assert (report.largest_cell, report.single_member_cells) == (largest, singles)
 
 
+def test_members_weigh_again_what_they_show_of_the_mass(source, tmp_path, monkeypatch):
+    """All of the weight comes from images here."""
+    pixels, areas = [], []
+    observe, reduce_rows = images.observe, images.reduce_rows
+
+    def observing(*arguments):
+        views = observe(*arguments)
+        pixels.append(views.contributions)
+        return views
+
+    def noting(job, rows, target, *, importance):
+        areas.append(rows.apparent_areas * rows.scene.opacities)
+        return reduce_rows(job, rows, target, importance=importance)
+
+    monkeypatch.setattr(images, "observe", observing)
+    monkeypatch.setattr(images, "reduce_rows", noting)
+    settings = MATCHED | {"visibility": MATCHED["visibility"] | {"mass_share": 0.0}}
+    in_blocks(source, tmp_path / "out.ply", settings, cameras=ring(10))
+    assert len(areas) == len(pixels) == BLOCKS
+    for masses, seen in zip(areas, pixels, strict=True):
+        own = seen[-len(masses) :].double()
+        torch.testing.assert_close(masses / masses.sum(), own / own.sum(), rtol=1e-3, atol=1e-9)
+
+
 def test_a_block_that_images_do_not_show_keeps_its_cells(source, tmp_path, monkeypatch):
     """Its first result is matched then."""
     observe = images.observe
