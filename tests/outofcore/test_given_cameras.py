@@ -15,6 +15,7 @@ from cvtgs.analysis.analyze import visibility_cameras
 from cvtgs.cameras import Cameras
 from cvtgs.cli.main import main
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.matching import cell_contributions
 from cvtgs.outofcore import LocalWorkers, images, simplify_file
 from cvtgs.outofcore.images import cameras_of_block
 from cvtgs.rendering import contributions, render
@@ -106,22 +107,38 @@ def test_blocks_have_more_cells_where_images_err_only_with_given_cameras(scene, 
     assert errors["given", 1.0] < 0.97 * errors["given", 0.0]
 
 
-def test_every_member_of_a_block_is_in_a_cell_again(source, tmp_path, monkeypatch):
-    found, reduce_rows = [], images.reduce_rows
+def test_every_member_of_a_block_is_in_a_cell_again(scene, tmp_path, monkeypatch):
+    """Also faint ones, of which the sort has left some; and the new cells are matched."""
+    logits = torch.where(torch.arange(len(scene)) % 2 == 0, -3.0, scene.logit_opacities)
+    cvtgs.save(scene.with_tensors({"logit_opacities": logits}), tmp_path / "in.ply")
+    found, matched, seen = [], [], []
+    reduce_rows, match_views = images.reduce_rows, images.match_views
 
     def noting(job, rows, target, *, importance):
         scene, reduced = reduce_rows(job, rows, target, importance=importance)
         found.append((len(rows.scene), target, importance, reduced))
         return scene, reduced
 
+    def matching(small, observed, targets, **options):
+        matched.append(targets)
+        seen.append(observed.contributions)
+        return match_views(small, observed, targets, **options)
+
     monkeypatch.setattr(images, "reduce_rows", noting)
-    report = in_blocks(source, tmp_path / "out.ply", MATCHED, cameras=ring(10))
+    monkeypatch.setattr(images, "match_views", matching)
+    settings = MATCHED | {"filter": {"min_opacity": 0.1}}
+    report = in_blocks(tmp_path / "in.ply", tmp_path / "out.ply", settings, cameras=ring(10))
+    assert 0 < report.filtered_count < len(scene) // 2
     assert sum(target for _, target, _, _ in found) == 150
-    assert [len(reduced.scene) for *_, reduced in found] == [target for _, target, *_ in found]
-    for count, _, importance, reduced in found:
+    for (count, target, importance, reduced), targets, pixels in zip(
+        found, matched, seen, strict=True
+    ):
+        assert len(reduced.scene) == target
         assert reduced.partition.order.sort().values.tolist() == list(range(count))
         assert importance.shape == (count,)
         assert importance.min() < 1.0 < importance.max()
+        wanted = cell_contributions(pixels[-count:], reduced.partition)
+        assert torch.equal(targets[-target:], wanted)
     largest = max(int(reduced.partition.counts.amax()) for *_, reduced in found)
     singles = sum(reduced.statistics.single_member_cells for *_, reduced in found)
     assert (report.largest_cell, report.single_member_cells) == (largest, singles)
