@@ -115,9 +115,9 @@ def test_every_member_of_a_block_is_in_a_cell_again(scene, tmp_path, monkeypatch
     reduce_rows, match_views = images.reduce_rows, images.match_views
 
     def noting(job, rows, target, *, importance):
-        scene, reduced = reduce_rows(job, rows, target, importance=importance)
+        reduced = reduce_rows(job, rows, target, importance=importance)
         found.append((len(rows.scene), target, importance, reduced))
-        return scene, reduced
+        return reduced
 
     def matching(small, observed, targets, **options):
         matched.append(targets)

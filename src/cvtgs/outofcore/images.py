@@ -205,7 +205,7 @@ def _allocate_again(
         share=job.config.visibility.mass_share,
     )
     rows = BlockRows(found.original, areas, found.visibility)
-    _, reduced = reduce_rows(job, rows, len(own), importance=importance)
+    reduced = reduce_rows(job, rows, len(own), importance=importance)
     if reduced.partition is None:
         return own, found, {}
     again = restore_columns(reduced.scene, found.original, job.read_scan().plan)

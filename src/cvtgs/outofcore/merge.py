@@ -131,9 +131,9 @@ def simplify_block(job: Job, block: int) -> None:
     if job.small_path(block).exists():
         return
     rows, scan = read_rows(job, block), job.read_scan()
-    scene, reduced = reduce_rows(job, rows, job.targets[block])
+    reduced = reduce_rows(job, rows, job.targets[block])
     report = BlockReport(
-        input_count=len(scene),
+        input_count=len(rows.scene),
         mass_out=float(reduced.scene.masses.sum()),
         **reduced.statistics.model_dump(),
     )
@@ -142,15 +142,15 @@ def simplify_block(job: Job, block: int) -> None:
 
 def reduce_rows(
     job: Job, rows: BlockRows, target: int, *, importance: Float[Tensor, "n"] | None = None
-) -> tuple[GaussianScene, Reduced]:
-    """Simplify rows like a scene of their own; also return the columns of them that are used.
+) -> Reduced:
+    """Simplify rows, which the sort has filtered, like a scene of their own.
 
-    ``importance`` is that of :func:`cvtgs.pipeline.reduce_scene`. The sort has filtered the rows.
+    ``importance`` is that of :func:`cvtgs.pipeline.reduce_scene`.
     """
     scene = select_columns(rows.scene, job.config.effects)
     no_filter = {"min_opacity": 0.0, "max_flyaway_share": 0.0}
     filter_config = job.config.filter.model_copy(update=no_filter)
-    reduced = reduce_scene(
+    return reduce_scene(
         scene,
         analysis_of(job.read_scan(), rows._replace(scene=scene)),
         target,
@@ -159,7 +159,6 @@ def reduce_rows(
         clock=StageClock(silent, scene.device),
         importance=importance,
     )
-    return scene, reduced
 
 
 def read_cells(job: Job, block: int) -> BlockCells:
