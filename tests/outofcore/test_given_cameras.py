@@ -184,6 +184,15 @@ def test_a_block_that_images_do_not_show_keeps_its_cells(source, tmp_path, monke
     assert in_blocks(source, tmp_path / "out.ply", MATCHED, cameras=ring(10)).output_count == 150
 
 
+def test_blocks_that_keep_all_gaussians_keep_their_cells(source, scene, tmp_path):
+    simplifier = Simplifier(config=SimplifyConfig.from_mapping(MATCHED), device="cpu")
+    path, cameras = tmp_path / "out.ply", ring(10)
+    report = simplify_file(
+        source, path, count=len(scene), blocks=BLOCKS, simplifier=simplifier, cameras=cameras
+    )
+    assert (report.output_count, report.largest_cell) == (len(scene), 1)
+
+
 def test_a_block_takes_the_cameras_that_show_it(scene):
     """Of ten cameras, five look at the block, one from far away, and four elsewhere."""
     beside = scene.with_tensors({"means": scene.means + torch.tensor([100.0, 0, 0])})

@@ -187,7 +187,7 @@ def _allocate_again(
     blocks do not wait for each other. Also return what changes in its report.
     """
     scene, pixels = found.scene, observed.contributions[drawn.fixed :]
-    if len(own) == len(scene) or not bool(pixels.any()):
+    if not bool(pixels.any()):
         return own, found, {}
     importance = importance_by_errors(
         drawn.small[drawn.fixed :],
@@ -206,7 +206,7 @@ def _allocate_again(
     )
     rows = BlockRows(found.original, areas, found.visibility)
     reduced = reduce_rows(job, rows, len(own), importance=importance)
-    if reduced.partition is None:
+    if reduced.partition is None:  # all Gaussians are kept
         return own, found, {}
     again = restore_columns(reduced.scene, found.original, job.read_scan().plan)
     names = ("single_member_cells", "largest_cell")
