@@ -278,13 +278,8 @@ def measure_visibility(
         rendered = contributions(used, views)
     opacities, apparent = analysis.opacities, analysis.apparent_areas
     if float(rendered.sum()) > 0.0:
-        apparent = measured_areas(
-            apparent,
-            opacities,
-            rendered,
-            mass_per_pixel=(apparent * opacities).double().sum() / rendered.sum(),
-            share=config.visibility.mass_share,
-        )
+        share = config.visibility.mass_share
+        apparent = measured_areas(apparent, opacities, rendered, share=share)
     haze = plan_haze(float(haze_share(opacities, apparent * opacities, config)), config)
     plan = analysis.plan.model_copy(update={"haze": haze})
     return replace(analysis, apparent_areas=apparent, plan=plan, observed=observed)
@@ -314,10 +309,15 @@ def measured_areas(
     opacities: Float[Tensor, "n"],
     contributions: Float[Tensor, "n"],
     *,
-    mass_per_pixel: Float[Tensor, ""],
     share: float,
+    mass_per_pixel: Float[Tensor, ""] | None = None,
 ) -> Float[Tensor, "n"]:
-    """Return apparent areas that are corrected by the contributions to images."""
+    """Return apparent areas that are corrected by the contributions to images.
+
+    ``mass_per_pixel`` is that of a larger scene; None for that of these Gaussians.
+    """
+    if mass_per_pixel is None:
+        mass_per_pixel = (areas * opacities).double().sum() / contributions.sum()
     shown = (1.0 - share) * contributions * mass_per_pixel
     blended = share * (areas * opacities).double() + shown
     return divide(blended, opacities.double().clamp_min(MIN_OPACITY)).to(areas.dtype)

@@ -197,13 +197,8 @@ def _allocate_again(
         count=len(scene),
         power=job.config.match.error_power,
     )
-    areas = measured_areas(
-        found.apparent_areas,
-        scene.opacities,
-        pixels,
-        mass_per_pixel=(found.apparent_areas * scene.opacities).sum() / pixels.sum(),
-        share=job.config.visibility.mass_share,
-    )
+    share = job.config.visibility.mass_share
+    areas = measured_areas(found.apparent_areas, scene.opacities, pixels, share=share)
     rows = BlockRows(found.original, areas, found.visibility)
     reduced = reduce_rows(job, rows, len(own), importance=importance)
     if reduced.partition is None:  # all Gaussians are kept
