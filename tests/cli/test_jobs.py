@@ -121,7 +121,7 @@ def test_a_scene_that_fails_does_not_stop_the_others(
         ),
         (["a.ply", "./a.ply", "-o", "out"], "every scene must be given once, found a.ply twice."),
         (["nothing*", "-o", "out"], "nothing*: the pattern must match a file, found none."),
-        (["a.ply", "-o", "a.ply"], "a.ply: must be a folder or a new path, found: "),
+        (["a.ply", "-o", "note"], "note: must be a folder or a new path, found: "),
         (["a.ply", "c.spz", "-o", "out", "--suffix", "xyz"], "--suffix must end in "),
     ],
 )
@@ -129,6 +129,7 @@ def test_invalid_jobs_are_refused_before_the_work(
     scenes: Path, capsys: pytest.CaptureFixture[str], words: list[str], text: str
 ) -> None:
     Path("a.spz").write_bytes(Path("c.spz").read_bytes())
+    Path("note").touch()
     assert main(["convert", *words, "--overwrite"]) == 1
     printed = capsys.readouterr()
     assert printed.out == ""

@@ -155,8 +155,9 @@ def test_cameras_beside_the_scene_are_read_only_if_levels_use_images(
 
 def test_levels_need_a_folder_to_write_to(tmp_path, capsys):
     save(random_scene(30), tmp_path / "a.ply")
-    assert main(["levels", str(tmp_path / "a.ply"), "-o", str(tmp_path / "a.ply")]) == 1
-    assert "a.ply: must be a folder or a new path, found: file exists" in capsys.readouterr().err
+    (tmp_path / "note").touch()
+    assert main(["levels", str(tmp_path / "a.ply"), "-o", str(tmp_path / "note")]) == 1
+    assert "note: must be a folder or a new path, found: file exists" in capsys.readouterr().err
 
 
 def test_a_level_does_not_replace_its_scene(tmp_path, capsys):

@@ -19,7 +19,7 @@ from cvtgs.cli.display import (
     send_file,
 )
 from cvtgs.cli.options import READABLE, WRITABLE, CommandParser, dotted, is_same_file
-from cvtgs.cli.paths import new_folder
+from cvtgs.cli.paths import folder_or_file, names_file
 from cvtgs.errors import (
     CvtgsError,
     InputError,
@@ -76,9 +76,10 @@ def add_paths(parser: CommandParser, *, options: str) -> None:
         "-o",
         "--output",
         dest="folder",
-        type=new_folder,
+        type=folder_or_file,
         metavar="DIR",
-        help="directory to write to; each scene keeps its name",
+        help="directory to write to; each scene keeps its name (the name of a file, such as "
+        "small.ply, is OUT of one scene)",
     )
     parser.add_argument(
         "--suffix",
@@ -93,6 +94,11 @@ def check_paths(parser: CommandParser, options: argparse.Namespace) -> None:
     """Exit with a usage error if the paths do not match the use of -o and --suffix."""
     if "" in options.paths:
         parser.error("IN and OUT must be paths, found ''")
+    if options.folder is not None and names_file(options.folder):
+        if len(options.paths) != 1:
+            scenes = counted(len(options.paths), "scene")
+            parser.error(f"-o must be a folder for {scenes}, found {str(options.folder)!r}")
+        options.paths, options.folder = [*options.paths, str(options.folder)], None
     if options.folder is None and len(options.paths) != 2:
         found = f"{counted(len(options.paths), 'path')} ({shortened(', '.join(options.paths), 60)})"
         parser.error(

@@ -4,6 +4,11 @@ import argparse
 import os
 from pathlib import Path
 
+_SCENES = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf", ".usda")
+
+FILE_SUFFIXES = (*_SCENES, ".html", ".json", ".csv", ".png", ".jpg")
+"""Suffixes of files that commands write; a new folder with such a name would be a mistake."""
+
 
 def any_path(text: str) -> Path:
     """Read a path; an empty one, such as a shell variable without a value, is an error."""
@@ -22,9 +27,23 @@ def new_file(text: str) -> Path:
 
 
 def new_folder(text: str) -> Path:
-    """Read the path of a folder to write to."""
+    """Read the path of a folder to write to, which has no name like that of a file."""
+    folder = folder_or_file(text)
+    if names_file(folder):
+        raise argparse.ArgumentTypeError(f"must be a folder, found the file name {text!r}")
+    return folder
+
+
+def folder_or_file(text: str) -> Path:
+    """Read the path of a folder or file to write to, which standard output cannot replace."""
     if text == "-":
         raise argparse.ArgumentTypeError(
             "must be a folder, found '-'; simplify and convert take IN and - for standard output"
         )
     return any_path(text)
+
+
+def names_file(path: Path) -> bool:
+    """Return whether a path is no folder and ends like a file that commands write."""
+    is_folder = os.path.isdir(path)  # noqa: PTH112 (false for impossible names)
+    return path.name.lower().endswith(FILE_SUFFIXES) and not is_folder
