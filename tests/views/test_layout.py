@@ -38,8 +38,17 @@ def voxels_at(points: Tensor, normals: Tensor | None = None) -> Voxels:
 
 def layout_of(**changes) -> SceneLayout:
     frame = RobustFrame(center=torch.zeros(3).double(), radius=1.0)
-    plain = {"frame": frame, "up": UP, "floor": None, "room": None}
+    plain = {"frame": frame, "up": UP, "floor": None, "room": None, "cutaway": None}
     return replace(layout.find_layout(random_scene(20)), **plain | changes)
+
+
+def test_a_surface_hides_what_is_behind_it_but_not_what_is_beside_or_before_it():
+    wall = torch.cartesian_prod(torch.linspace(-0.5, 0.5, 11), torch.linspace(-0.5, 0.5, 11))
+    points = torch.cat([torch.ones(121, 1), wall], dim=1).double()
+    behind, before, beside, over = [2.0, 0, 0.03], [0.8, 0, 0], [2.0, 1.4, 0], [2.0, 0, 1.4]
+    eyes = torch.tensor([behind, before, beside, over, [-2.0, 0, 0], [0.0, 0, 0]]).double()
+    hidden = layout.are_hidden(eyes, torch.zeros(3).double(), points)
+    assert hidden.tolist() == [True, False, False, False, False, False]
 
 
 def test_a_layout_is_found_from_valid_rows_only():

@@ -29,8 +29,8 @@ CONVENTIONS = {
 DOWN = torch.tensor([0.0, 1.0, 0.0])
 
 
-def turned(kind: str, quat: tuple[float, ...]) -> cvtgs.GaussianScene:
-    scene = cvtgs.synthetic.scene(kind, 4000, sh_degree=0, seed=1)
+def turned(kind: str, quat: tuple[float, ...], count: int = 4000) -> cvtgs.GaussianScene:
+    scene = cvtgs.synthetic.scene(kind, count, sh_degree=0, seed=1)
     matrix = parameters.quats_to_matrices(torch.tensor([quat]))[0]
     frames = parameters.quats_to_matrices(parameters.normalize_quats(scene.quats))
     tensors = {
@@ -141,6 +141,57 @@ def test_views_of_a_room_are_inside_of_it():
         automatic_views(scene, 4, width=32, height=32),
     ):
         assert bool(((cameras.centers > low) & (cameras.centers < high)).all())
+
+
+def cut_room(*, convention: str = "y-down", wall: bool = True) -> cvtgs.GaussianScene:
+    """Return a room without its ceiling and, unless ``wall``, without the wall at the largest x."""
+    room = turned("room", CONVENTIONS[convention], 20_000)
+    means = turned("room", CONVENTIONS["y-down"], 20_000).means
+    low, high = means.quantile(0.01, dim=0), means.quantile(0.99, dim=0)
+    across, down, _ = ((means - low) / (high - low)).unbind(1)
+    return room[(down > 0.1) & ((across < 0.9) | wall)]
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_a_room_cut_open_is_viewed_from_its_open_side_or_from_inside(convention, monkeypatch):
+    scene = cut_room(convention=convention, wall=False)
+    layout = find_layout(scene)
+    assert layout.room is None
+    assert layout.cutaway is not None
+    matrix = parameters.quats_to_matrices(torch.tensor([CONVENTIONS[convention]]))[0].double()
+    middle = layout.cutaway @ matrix
+    low, high = (scene.means.double() @ matrix).quantile(torch.tensor([0.02, 0.98]).double(), 0)
+
+    def is_behind(cameras: Cameras) -> Tensor:
+        """Return which level lines from the middle leave the walls elsewhere than at the side."""
+        steps = (cameras.centers @ matrix - middle)[:, [0, 2]]
+        room = torch.where(steps > 0, (high - middle)[[0, 2]], (middle - low)[[0, 2]])
+        leaves = steps.abs() / room
+        return (leaves.amax(dim=1) > 1.1) & ~((steps[:, 0] > 0) & (leaves[:, 0] > leaves[:, 1]))
+
+    def views() -> list[Cameras]:
+        return [automatic_views(scene, 8, width=32, height=32), mixed_views(scene, 24, size=32)]
+
+    assert all(not bool(is_behind(cameras).any()) for cameras in views())
+    monkeypatch.setattr("cvtgs.views.layout._WALLED", 2.0)
+    assert all(bool(is_behind(cameras).any()) for cameras in views())
+
+
+def test_a_room_without_a_ceiling_is_viewed_from_above_or_from_inside():
+    scene = cut_room()
+    low, high = scene.means.double().quantile(torch.tensor([0.02, 0.98]).double(), dim=0)
+    slack = 0.1 * (high - low)
+    for cameras in (automatic_views(scene, 8, width=32, height=32), mixed_views(scene, 8, size=32)):
+        level = cameras.centers[:, [0, 2]]
+        assert bool((level > (low - slack)[[0, 2]]).all())
+        assert bool((level < (high + slack)[[0, 2]]).all())
+
+
+@pytest.mark.parametrize("kind", ["object", "courtyard", "landscape", "haze", "thin", "room"])
+def test_other_scenes_are_no_rooms_cut_open(kind):
+    for seed in range(2):
+        scene = cvtgs.synthetic.scene(kind, 4000, sh_degree=0, seed=seed)
+        assert find_layout(scene).cutaway is None
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cvtgs.errors import InvalidSceneError
@@ -28,6 +28,9 @@ was measured. Hollow objects have outer sides, a base and things beside them: 0.
 
 _BEHIND = 1.3  # a surface over this many times as far, plus one voxel, is behind another
 _FARTHEST = 6.0
+_WALL_RAYS = 24  # level directions in which walls are searched
+_WALLED = 0.4  # least share of them with a wall in a room without a ceiling or other walls
+_REACHED = 0.75  # a line that passes a voxel within this many edges meets its surface
 _MOST_POINTS = 10_000
 _CELLS = 10
 _LEAST_IN_CELL = 8
@@ -60,11 +63,11 @@ def find_room(
     *,
     middle: Float[Tensor, "3"],
     up: Float[Tensor, "3"],
-) -> Float[Tensor, "3"] | None:
-    """Return the eye point in the middle of a room, in robust radii; None if it is not a room."""
+) -> tuple[Float[Tensor, "3"] | None, Float[Tensor, "3"] | None]:
+    """Return the eye point of a room, and that of a room cut open, in robust radii, or None."""
     points = voxels.points
     if len(points) == 0:
-        return None
+        return None, None
     heights = points @ up
     low, high = heights.quantile(heights.new_tensor([0.02, 0.98])).tolist()
     center = middle - (middle @ up) * up
@@ -74,15 +77,32 @@ def find_room(
     eyes = ((center + offsets)[:, None] + lifts[:, None] * up).reshape(-1, 3)
     clearance = torch.cdist(eyes, points).amin(dim=1)
     best = eyes[clearance.argmax()]
-    if float(clearance.amax()) < FREE or enclosure(best, points, up) < ENCLOSED:
-        return None
-    if hidden_share(best, points) > _HIDDEN:
-        return None
+    if float(clearance.amax()) < FREE or hidden_share(best, points) > _HIDDEN:
+        return None, None
     place = frame.center + frame.radius * best
     if size_growths(sized, place[None], frame.radius, least_cells=_LEAST_CELLS)[0] < _GROWS:
-        return None
-    eye: Tensor = center + (0.58 * (high - low) + low) * up
-    return eye
+        return None, None
+    if enclosure(best, points, up) >= ENCLOSED:
+        return center + (0.58 * (high - low) + low) * up, None
+    right, ahead = level_axes(up)
+    angles = torch.arange(_WALL_RAYS, dtype=points.dtype, device="cpu") * (math.tau / _WALL_RAYS)
+    level = angles.cos()[:, None] * right + angles.sin()[:, None] * ahead
+    walls = are_hidden(best + _NEAR * level, best, points)
+    return None, best if float(walls.double().mean()) >= _WALLED else None
+
+
+def are_hidden(
+    eyes: Float[Tensor, "e 3"], target: Float[Tensor, "3"], points: Float[Tensor, "v 3"]
+) -> Bool[Tensor, "e"]:
+    """Return which positions have a surface between them and a target; all in robust radii."""
+    directions, distances = eyes - target, torch.linalg.vector_norm(eyes - target, dim=1)
+    directions = divide(directions, distances[:, None])
+    offsets = points - target
+    along = directions @ offsets.T
+    aside = offsets.square().sum(dim=1) - along.square()
+    near = (aside < (_REACHED * VOXEL_SIZE) ** 2) & (along > 0) & (along < distances[:, None])
+    hidden: Tensor = near.any(dim=1)
+    return hidden
 
 
 def enclosure(
@@ -186,6 +206,7 @@ class SceneLayout:
     height: float  # extent along ``up`` of the content near the middle
     floor: float | None  # height along ``up``; None without a floor
     room: Float[Tensor, "3"] | None  # eye point in its middle; None if not seen from inside
+    cutaway: Float[Tensor, "3"] | None  # middle of a room without a ceiling or some of its walls
 
     @property
     def subject(self) -> Float[Tensor, "3"]:
@@ -229,7 +250,7 @@ def find_layout(scene: GaussianScene) -> SceneLayout:
     center = frame.center + frame.radius * middle
     floor = find_floor(voxels, up)
     sized = sized_points(sample)
-    room = find_room(voxels, sized, frame, middle=middle, up=up)
+    room, cutaway = find_room(voxels, sized, frame, middle=middle, up=up)
     return SceneLayout(
         sample=sample,
         device=scene.device,
@@ -243,6 +264,7 @@ def find_layout(scene: GaussianScene) -> SceneLayout:
         height=frame.radius * float(heights[1] - heights[0]),
         floor=None if floor is None else float(frame.center @ up) + frame.radius * floor,
         room=None if room is None else frame.center + frame.radius * room,
+        cutaway=None if cutaway is None else frame.center + frame.radius * cutaway,
     )
 
 

@@ -20,6 +20,7 @@ from cvtgs.views.layout import (
     ENCLOSED,
     FREE,
     SceneLayout,
+    are_hidden,
     covering_sample,
     enclosure,
     find_layout,
@@ -55,6 +56,9 @@ _ASKED = 32
 _MEASURED = (16, 64)  # positions to look closely from: a few, then more where these see clutter
 _SAMPLE = 60_000
 _FEW = 20_000  # scenes of fewer Gaussians are coarse from everywhere
+_WALL_STEPS = (-0.15, -0.05, 0.05, 0.15)
+"""Heights above the middle of a room, robust radii, at half of which or more a wall has no gap."""
+
 _COARSE = 2.0  # the finest tenth of an image of clutter is over this many times that of clear ones
 _SUSPECT, _SUSPECTED = 0.03, 0.25
 _LARGE = 0.015  # least size of the finest splats of clutter, robust radii
@@ -87,10 +91,10 @@ class CameraPositions:
         """Return a mask of the good positions.
 
         A good position is free, above the floor if there is one, and inside the room if the scene
-        is one, else not enclosed. Near Gaussians must also be smaller than distant ones, as is
-        usual where images were taken, unless the position faces, from outside, a side of small
-        Gaussians: the smooth back of an object. No position with clutter before the scene may be
-        nearer than one without.
+        is one, else not enclosed. If the room lacks a ceiling or walls, none of the others may hide
+        its middle. Near Gaussians must also be smaller than distant ones, as is usual where images
+        were taken, unless the position faces, from outside, a side of small Gaussians: the smooth
+        back of an object. No position with clutter before the scene may be nearer than one without.
 
         Args:
             eyes: Positions, scene units.
@@ -231,7 +235,7 @@ def lifted(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Float[Tensor, "c 
 
 
 def stand_free(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, "c"]:
-    """Return which positions are above the floor, free, and not inside matter."""
+    """Return which positions are above the floor, free, and not behind walls or inside matter."""
     radius, points = layout.frame.radius, layout.voxels.points
     free = torch.ones(len(eyes), dtype=torch.bool, device="cpu")
     if layout.floor is not None:
@@ -240,6 +244,8 @@ def stand_free(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, 
         return free
     local = layout.frame.normalize(eyes)
     free &= torch.cdist(local, points).amin(dim=1) >= FREE
+    if layout.cutaway is not None:
+        free &= ~_behind_walls(layout, layout.cutaway, local)
     for row in free.nonzero()[:, 0].tolist():
         above = enclosure(local[row], points, layout.up)
         if layout.room is not None:
@@ -247,6 +253,21 @@ def stand_free(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, 
         elif above >= _BURIED:
             free[row] = enclosure(local[row], points, -layout.up) < _BURIED
     return free
+
+
+def _behind_walls(
+    layout: SceneLayout, middle: Float[Tensor, "3"], local: Float[Tensor, "c 3"]
+) -> Bool[Tensor, "c"]:
+    """Return which positions, in robust radii, are behind the walls of a room that is cut open.
+
+    Images were taken inside or from its open side, not over its walls from behind, so there may be
+    no wall between the middle and a position, nor the position lowered to the height of the middle.
+    """
+    target, points = layout.frame.normalize(middle[None])[0], layout.voxels.points
+    level = local - ((local - target) @ layout.up)[:, None] * layout.up
+    steps = [step * layout.up for step in _WALL_STEPS]
+    walls = torch.stack([are_hidden(level + step, target + step, points) for step in steps])
+    return are_hidden(local, target, points) | (2 * walls.sum(dim=0) >= len(steps))
 
 
 def _sharp_sides(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, "d"]:
