@@ -129,7 +129,7 @@ def test_configurations_are_frozen():
 
 def test_sections_can_be_used_on_their_own():
     assert TessellationConfig(iterations=0).iterations == 0
-    with pytest.raises(ConfigError, match=r"^iteration: is not a known setting\.$"):
+    with pytest.raises(ConfigError, match=r"^iteration: is not .*; did you mean iterations\?$"):
         TessellationConfig(iteration=0)
 
 
@@ -151,7 +151,10 @@ def test_the_constructor_starts_from_the_preset(name):
     ("values", "message"),
     [
         ({"rho": 0.1}, "rho: is not a known setting."),
-        ({"cvt": {"itertions": 3}}, "cvt.itertions: is not a known setting."),
+        (
+            {"cvt": {"itertions": 3}},
+            "cvt.itertions: is not a known setting; did you mean cvt.iterations?",
+        ),
         (
             {"cvt": {"iterations": -1}},
             "cvt.iterations: input should be greater than or equal to 0, found -1.",
@@ -234,7 +237,7 @@ def test_an_unknown_preset_by_name_is_an_error():
     ("settings", "message"),
     [
         ({"cvt.speed": "1"}, "cvt.speed: is not a known setting."),
-        ({"speed": "1"}, "speed: is not a known setting."),
+        ({"speed": "1"}, "speed: is not a known setting; did you mean seed?"),
         ({"a.b.c": "1"}, "a: is not a known setting."),
         ({"seed": "2", "seed.x": "1"}, "seed.x: is not a known setting."),
     ],

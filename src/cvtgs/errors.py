@@ -30,6 +30,8 @@ __all__ = [
     "TrainingError",
 ]
 
+_ADDRESS = re.compile(r"(https?|ftp):/")
+
 _NO_MEMORY = re.compile(
     r"(?i)(can.?not|can't|not enough|out of|failed to) (allocate )?memory|bad.?alloc|"
     r"ALLOC_FAILED|failed to map segment|can't start new thread|could not allocate|"
@@ -178,7 +180,8 @@ def input_errors(path: str | os.PathLike[str]) -> Iterator[None]:
     except CvtgsError:
         raise
     except FileNotFoundError as error:
-        raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
+        found = "a web address; download it first" if _ADDRESS.match(str(path)) else "none"
+        raise InputNotFoundError(f"{path}: the file to read must exist, found {found}.") from error
     except OSError as error:
         reason = reason_of(error)
         raise InputError(f"{path}: the file must be readable, found: {reason}.") from error

@@ -325,8 +325,7 @@ class GaussianScene:
 
     def _repr_html_(self) -> str:
         """Return HTML with an image and facts, for notebooks."""
-        text: str = resolve_name("cvtgs.notebooks:scene_html")(self)
-        return text
+        return str(resolve_name("cvtgs.notebooks:scene_html")(self))
 
 
 SceneLike = GaussianScene | str | os.PathLike[str]
@@ -346,8 +345,9 @@ def as_scene(scene: SceneLike, name: str = "scene") -> GaussianScene:
     is_path = isinstance(scene, str | os.PathLike)
     found = resolve_name("cvtgs.io.formats:load")(scene) if is_path else scene
     if not isinstance(found, GaussianScene):
+        kind = type(scene).__name__ + " (use cvtgs.from_dict)" * isinstance(scene, Mapping)
         raise InvalidArgumentError(
-            f"{name} must be a GaussianScene or the path of one, found {type(scene).__name__}."
+            f"{name} must be a GaussianScene or the path of one, found {kind}."
         )
     check_scene(found, name)
     return found

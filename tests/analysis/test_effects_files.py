@@ -118,7 +118,11 @@ def test_info_lists_every_effect_with_its_evidence(source, capsys):
     [
         ("sh", "--effects needs NAME=VALUE, for example sh=1,mip=off; found 'sh'."),
         ("sh=1,,", "--effects needs NAME=VALUE, for example sh=1,mip=off; found ''."),
-        ("fog=on", "effects.fog: is not a known setting."),
+        (
+            "fog=on",
+            "effects.fog: is not a known setting; there are sh, mip, unbounded, haze, flat, "
+            "duplicates, extras, visibility.",
+        ),
         ("sh=4", "effects.sh: input should be 'auto', 'on', 'off', 0, 1, 2 or 3, found '4'."),
         ("mip=maybe", "effects.mip: input should be 'auto', 'on' or 'off', found 'maybe'."),
         ("flat=on", "effects.flat: input should be 'auto' or 'off', found 'on'."),

@@ -13,7 +13,7 @@ from cvtgs.budget import CostModel, Found
 from cvtgs.budget.calibrate import CANDIDATES
 from cvtgs.budget.costs import FEATURES
 from cvtgs.cli.display import target_note
-from cvtgs.cli.goals import STARTED, check_goals, choose_preset, read_seconds
+from cvtgs.cli.goals import STARTED, check_goals, choose_preset
 from cvtgs.cli.main import build_parser, main
 from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.progress import silent
@@ -51,16 +51,26 @@ def measured(monkeypatch) -> list[bool]:
 
 @pytest.mark.parametrize(
     ("text", "seconds"),
-    [("20s", 20.0), ("20", 20.0), (" 2m", 120.0), ("1.5min", 90.0), ("0.5h", 1800.0)],
+    [
+        ("20s", 20.0),
+        ("20", 20.0),
+        (" 2m", 120.0),
+        ("1.5min", 90.0),
+        ("0.5h", 1800.0),
+        ("500ms", 0.5),
+    ],
 )
-def test_time_budgets_are_read_in_seconds(text, seconds):
-    assert read_seconds(text) == seconds
+def test_times_are_read_in_seconds(text, seconds):
+    assert options("--rho", "0.1", "--time-budget", text).time_budget == seconds
+    assert options("--rho", "0.1", "--refine", text).refine == seconds
 
 
-@pytest.mark.parametrize("text", ["", "s", "-3s", "0", "20 parsecs", "nan", "inf", "1:30"])
-def test_invalid_time_budgets_are_refused(text):
-    with pytest.raises(InvalidArgumentError, match="--time-budget must be a time above 0"):
-        read_seconds(text)
+@pytest.mark.parametrize("option", ["--time-budget", "--refine"])
+@pytest.mark.parametrize("text", ["", "s", "-3s", "20 parsecs", "nan", "inf", "1:30", "1.2.3s"])
+def test_invalid_times_are_refused(option, text, capsys):
+    with pytest.raises(SystemExit):
+        options("--rho", "0.1", f"{option}={text}")
+    assert f"{option}: must be a time in ms, s, min or h, for" in capsys.readouterr().err
 
 
 def test_some_options_exclude_each_other(capsys):
@@ -77,6 +87,7 @@ def test_some_options_exclude_each_other(capsys):
 @pytest.mark.parametrize(
     ("words", "text"),
     [
+        (["--rho", "0.1", "--time-budget", "0s"], "--time-budget must be above 0, found 0 s."),
         (["--rho", "0.1", "--recalibrate"], "--recalibrate needs --time-budget."),
         (["--rho", "0.1", "--shipped-rates"], "--shipped-rates needs --time-budget."),
         (

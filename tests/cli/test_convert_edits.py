@@ -94,6 +94,11 @@ def test_edits_use_the_axes_of_a_ply(tmp_path: Path, scene: GaussianScene) -> No
         (["--rotate", "90"], "--rotate must be three numbers x,y,z, degrees about each axis, fou"),
         (["--translate", "nan,0,0"], "--translate must be three numbers x,y,z, found 'nan,0,0'"),
         (["--merge", "missing.ply"], "missing.ply: the file to read must exist, found none."),
+        (
+            ["--merge", "https://example.org/a.ply"],
+            "https:/example.org/a.ply: the file to read must exist, found a web address; download "
+            "it first.",
+        ),
     ],
 )
 def test_invalid_edits_write_nothing(

@@ -59,11 +59,11 @@ def test_a_folder_is_expanded_to_the_scenes_in_it(
     (scenes / "model").mkdir()  # the folder of a trained model is one scene
     cvtgs.save(cvtgs.load("a.ply"), "model/point_cloud.ply")
     (scenes / "model" / "other.ply").write_text("not read")
-    assert main(["convert", ".", "model", "-o", "out", "--suffix", ".splat", "--quiet"]) == 0
+    (scenes / "none").mkdir()  # holds no scene
+    assert main(["convert", ".", "-o", "out", "--suffix", ".splat", "--quiet"]) == 0
     assert {path.name for path in Path("out").iterdir()} == {
         *("a.splat", "b.splat", "c.splat", "model.splat")
     }
-    (scenes / "none").mkdir()
     assert main(["convert", "none", "-o", "out"]) == 1
     assert "none: must be a file or the folder of a trained model" in capsys.readouterr().err
 

@@ -129,7 +129,8 @@ def test_without_a_command_the_help_is_printed(capsys):
         ),
         (
             ["simplify", "a.ply", "b.ply", "--rho", "1", "--refine", "x"],
-            "argument --refine: must be a number, found 'x'\n",
+            "argument --refine: must be a time in ms, s, min or h, for example 20s or 2m, found "
+            "'x'\n",
         ),
         (
             ["simplify", "a.ply", "b.ply", "--rho", "1", "--report", "d/"],

@@ -66,14 +66,6 @@ def test_refinement_is_off_by_default(source, tmp_path):
     ("words", "text"),
     [
         (
-            ["--refine", "-1"],
-            "refine.seconds: input should be greater than or equal to 0, found '-1.0'.",
-        ),
-        (
-            ["--refine", "nan"],
-            "refine.seconds: input should be a finite number, found 'nan'.",
-        ),
-        (
             ["--refine-steps", "-2"],
             "refine.steps: input should be greater than or equal to 0, found '-2'.",
         ),

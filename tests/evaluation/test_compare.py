@@ -156,7 +156,7 @@ def test_photographs_are_scored_for_every_scene(scene, small, cameras):
 def test_evaluate_refuses_invalid_arguments(scene, cameras):
     for wrong, message in (
         ({"full": scene}, "the name of the full"),
-        (scene, "must be of type Mapping"),
+        (scene, "must be a dictionary of scenes by name, such as"),
     ):
         with pytest.raises(InvalidArgumentError, match=message):
             evaluate(scene, wrong, cameras, settings=OFF)

@@ -136,6 +136,11 @@ def test_the_mapping_is_not_changed() -> None:
             f"the names must be {KNOWN}, found 'colors'.",
         ),
         (
+            {"step": 7, "splats": {}},
+            False,
+            f"the names must be {KNOWN}, found 'step'; pass the dictionary at 'splats'.",
+        ),
+        (
             {"features_dc": torch.zeros(2, 3)},
             False,
             "a dictionary must hold sh0 only once, found 'sh0' and 'features_dc'.",

@@ -202,6 +202,9 @@ def test_text_files_and_closed_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"must be open in binary mode, found text"):
         cvtgs.load(io.StringIO("ply"))  # type: ignore[arg-type]
     scene, path = storable_scene(5), tmp_path / "a.ply"
+    path.write_bytes(b"ply\n\xea")
+    with path.open(encoding="utf-8") as file, pytest.raises(InputError, match="found text; open"):
+        cvtgs.load(file)  # type: ignore[arg-type]
     with path.open("w") as file, pytest.raises(OutputError, match=r"a\.ply: must be open for writ"):
         cvtgs.save(scene, file)  # type: ignore[arg-type]
     cvtgs.save(scene, path, overwrite=True)

@@ -34,7 +34,7 @@ def test_gaussians_that_no_view_shows_stay_bit_for_bit():
         },
         {},
     )
-    seen = discolored(full)
+    seen = discolored(full)[count:]
     both = seen.with_tensors(
         {name: torch.cat([ours, behind.tensors()[name]]) for name, ours in seen.tensors().items()},
         {},
@@ -42,7 +42,14 @@ def test_gaussians_that_no_view_shows_stay_bit_for_bit():
     scene, report = refine(both, full, steps=20, cameras=ring(), config=quick())
     assert report.gain > 0
     assert 0 < report.changed_count <= len(full)
-    assert same_bits(scene.select(torch.arange(len(full), len(both))), behind)
+    assert same_bits(scene[len(seen) :], behind)
+
+
+def test_the_simplified_scene_comes_first():
+    full = full_scene()
+    found = "small must have at most as many Gaussians as full, found 500 and 10; the simplified"
+    with pytest.raises(InvalidArgumentError, match=found):
+        refine(full, small_scene(full, 0.02), steps=1, config=quick())
 
 
 @pytest.mark.slow

@@ -126,6 +126,8 @@ def test_the_report_names_no_views_where_nothing_is_rendered():
 def test_the_error_names_an_argument_that_is_not_a_scene():
     with pytest.raises(InvalidArgumentError, match="scene must be a GaussianScene or the path of"):
         Simplifier(device="cpu").levels(3, [0.1])
+    with pytest.raises(InvalidArgumentError, match=r"found dict \(use cvtgs\.from_dict\)"):
+        cvtgs.simplify(cvtgs.to_dict(random_scene(30)), 0.1)
     cameras = cvtgs.views.automatic_views(random_scene(30), 1, width=32, height=24)
     with pytest.raises(InvalidArgumentError, match=r"scene .small. must be .*, found int"):
         cvtgs.evaluate(random_scene(30), {"small": 3}, cameras)

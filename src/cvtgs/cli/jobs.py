@@ -282,16 +282,24 @@ def _in_folder(folder: str) -> list[str]:
     """Return the scenes in a folder, or the path itself if it is a scene or no folder."""
     from cvtgs.io.formats import READABLE_SUFFIXES
 
-    if not os.path.isdir(folder):  # noqa: PTH112 (any path)
+    if not os.path.isdir(folder) or _is_scene(folder):  # noqa: PTH112 (any path)
         return [folder]
+    found = sorted(glob.glob(f"{glob.escape(folder)}/*"))  # noqa: PTH207 (as text)
+    scenes = [
+        path
+        for path in found
+        if path.lower().endswith(READABLE_SUFFIXES) or (os.path.isdir(path) and _is_scene(path))  # noqa: PTH112 (any path)
+    ]
+    return scenes or [folder]
+
+
+def _is_scene(folder: str) -> bool:
+    """Return whether a folder is a scene, such as that of a trained model or with a meta.json."""
     try:
         cvtgs.io.scene_file(folder)
     except InputError:
-        found = sorted(glob.glob(f"{glob.escape(folder)}/*"))  # noqa: PTH207 (as text)
-        scenes = [path for path in found if path.lower().endswith(READABLE_SUFFIXES)]
-        if scenes:
-            return scenes
-    return [folder]
+        return False
+    return True
 
 
 def check_one_scene(path: str | Path, advice: str = "") -> None:

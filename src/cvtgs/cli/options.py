@@ -32,6 +32,9 @@ PRESET_NAMES = "draft, fast, standard, matched, high (from the fastest to the be
 CAMERA_FILES = "transforms.json, a COLMAP model, cameras.json, or a folder of these"
 
 
+_UNITS = {"ms": 1e-3, "": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}  # in seconds
+
+
 def read_words(text: str) -> list[str]:
     """Read comma-separated words."""
     return [word.strip() for word in text.split(",") if word.strip()]
@@ -65,6 +68,17 @@ def count(text: str) -> int:
 
     with _usage_errors():
         return read_count(text)
+
+
+def seconds(text: str) -> float:
+    """Read a time in seconds, for argparse."""
+    found = re.fullmatch(r"([\d.]+(?:e[+-]?\d+)?)([a-z]*)", text.strip())
+    try:
+        return float(found[1]) * _UNITS[found[2]]  # type: ignore[index]
+    except (TypeError, ValueError, KeyError):
+        raise argparse.ArgumentTypeError(
+            f"must be a time in ms, s, min or h, for example 20s or 2m, found {text!r}"
+        ) from None
 
 
 @contextmanager
@@ -293,8 +307,11 @@ def read_settings(words: Sequence[str] = (), effects: str | None = None) -> dict
     settings = {f"effects.{name}": value for name, value in forced.items()}
     settings |= _assignments(words, "--set needs KEY=VALUE, for example cvt.iterations=10")
     known = list(_setting_names(cvtgs.SimplifyConfig))
+    there = [key.removeprefix("effects.") for key in known if key.startswith("effects.")]
     for key in settings:
         nearest = "" if key in known else suggestion(key, known, likeness=0.82)
+        if key.startswith("effects.") and key not in known and not nearest:
+            nearest = f"; there are {', '.join(there)}."
         if nearest:  # otherwise the configuration reports the unknown key
             raise ConfigError(f"{key}: is not a known setting{nearest}")
     return settings

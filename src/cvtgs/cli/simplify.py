@@ -24,6 +24,7 @@ from cvtgs.cli.options import (
     read_axes,
     read_scene,
     read_settings,
+    seconds,
 )
 from cvtgs.cli.paths import any_path, new_file
 from cvtgs.errors import (
@@ -91,6 +92,7 @@ def add_simplify(add_parser: AddParser) -> None:
     )
     parser.add_argument(
         "--time-budget",
+        type=seconds,
         metavar="TIME",
         help="use the best preset that is predicted to take at most this time, for example 20s or "
         "2m; the first use measures this machine, which takes about 10 seconds and does not count",
@@ -108,10 +110,11 @@ def add_simplify(add_parser: AddParser) -> None:
     add_options(parser, "--preset", "--ckpt", "--config", "--set", "--effects")
     parser.add_argument(
         "--refine",
-        type=float,
-        metavar="SECONDS",
-        help="time limit of refining the result against images of IN, as long as held-out views "
-        "improve; rendering the first images counts; 0 turns off the refinement of a preset",
+        type=seconds,
+        metavar="TIME",
+        help="time limit, for example 30s, of refining the result against images of IN, as long as "
+        "held-out views improve; rendering the first images counts; 0 turns off the refinement of "
+        "a preset",
     )
     parser.add_argument(
         "--refine-steps", type=int, metavar="N", help="step limit of refining the result"

@@ -1,6 +1,8 @@
 """Shared by configurations and reports: strict models, TOML reading, error texts."""
 
 import tomllib
+from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -10,6 +12,7 @@ from cvtgs.errors import ConfigError
 from cvtgs.text import shortened, shown
 
 MOST_PROBLEMS = 4  # maximum number of problems that one error message names
+LIKENESS = 0.82  # least likeness of an unknown setting to the one that a message suggests
 
 
 class Record(pydantic.BaseModel):
@@ -40,7 +43,7 @@ class Section(pydantic.BaseModel):
         try:
             super().__init__(**values)
         except pydantic.ValidationError as error:
-            raise ConfigError(explain(error)) from None
+            raise ConfigError(explain(error, type(self))) from None
 
     @pydantic.field_validator("*", mode="before")
     @classmethod
@@ -78,11 +81,14 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: is not a TOML file: {shortened(str(error), 200)}.") from None
 
 
-def explain(error: pydantic.ValidationError) -> str:
+def explain(
+    error: pydantic.ValidationError, model: type[pydantic.BaseModel] = pydantic.BaseModel
+) -> str:
     """Describe the validation errors of some settings in one sentence.
 
     Args:
         error: The error that pydantic raised.
+        model: The class of the settings, whose names are suggested for unknown ones.
 
     Returns:
         The first problems, each with its key and value, long ones shortened.
@@ -91,7 +97,7 @@ def explain(error: pydantic.ValidationError) -> str:
     for problem in error.errors(include_url=False)[:MOST_PROBLEMS]:
         key = named(".".join(str(part) for part in problem["loc"]))
         if problem["type"] == "extra_forbidden":
-            problems.append(f"{key}: is not a known setting")
+            problems.append(f"{key}: is not a known setting{_nearest(model, problem['loc'])}")
         elif problem["type"] == "model_type":
             problems.append(f"{key}: holds settings, found {shown(problem['input'], 120)}")
         elif problem["type"] == "value_error":  # raised by cvtgs, as a whole sentence
@@ -104,6 +110,19 @@ def explain(error: pydantic.ValidationError) -> str:
         problems.append(f"and {count - MOST_PROBLEMS:,} more")
     text = "; ".join(problems)
     return text if text.endswith("?") else f"{text}."
+
+
+def _nearest(model: type[pydantic.BaseModel], path: Sequence[int | str]) -> str:
+    """Return which setting of its section an unknown one may be meant to be."""
+    *sections, name = map(str, path)
+    for part in sections:
+        field = model.model_fields.get(part)
+        section = None if field is None else field.annotation
+        if not (isinstance(section, type) and issubclass(section, pydantic.BaseModel)):
+            return ""
+        model = section
+    near = get_close_matches(name, model.model_fields, n=1, cutoff=LIKENESS)
+    return f"; did you mean {'.'.join([*sections, near[0]])}?" if near else ""
 
 
 def named(key: str) -> str:

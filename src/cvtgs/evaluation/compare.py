@@ -216,7 +216,11 @@ def compare(  # noqa: PLR0913 (options by name)
 def _named_scenes(
     reference: SceneLike, small: Mapping[str, SceneLike], reference_name: str
 ) -> dict[str, GaussianScene]:
-    check_kinds({"small": Mapping}, {"small": small})
+    if not isinstance(small, Mapping):
+        raise InvalidArgumentError(
+            f'small must be a dictionary of scenes by name, such as {{"small": scene}}, found '
+            f"{type(small).__name__}."
+        )
     for name in (reference_name, *small):
         if not isinstance(name, str):
             raise InvalidArgumentError(f"names of scenes must be texts, found {shown(name)}.")

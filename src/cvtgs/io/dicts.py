@@ -179,7 +179,9 @@ def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
             continue
         name = _TENSORS.get(key.removeprefix(prefix)) if is_text else None
         if name is None:
-            raise InvalidSceneError(f"the names must be {_KNOWN}, found {shown(key)}.")
+            is_inner = isinstance(mapping.get("splats"), Mapping)  # as gsplat saves it
+            hint = "; pass the dictionary at 'splats'" if is_inner else ""
+            raise InvalidSceneError(f"the names must be {_KNOWN}, found {shown(key)}{hint}.")
         if name in keys:
             raise InvalidSceneError(
                 f"a dictionary must hold {name} only once, found {shown(keys[name])} "

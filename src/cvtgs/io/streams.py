@@ -102,6 +102,10 @@ def _renamed(text: str, path: Path, name: str) -> str:
     return text.replace(str(path), name).replace(f"{path.parent}{os.sep}", "")
 
 
+def _not_binary(name: str) -> InputError:
+    return InputError(f"{name}: must be open in binary mode, found text; open it with 'rb'.")
+
+
 def _chunks(stream: ByteSource, name: str) -> Iterator[bytes]:
     """Yield the rest of a stream, in pieces."""
     while True:
@@ -109,12 +113,14 @@ def _chunks(stream: ByteSource, name: str) -> Iterator[bytes]:
             chunk = stream.read(CHUNK_BYTES)
         except MemoryError:
             raise
+        except UnicodeDecodeError as error:  # a file that was opened as text
+            raise _not_binary(name) from error
         except Exception as error:  # archives and connections raise their own kinds
             raise InputError(
                 f"{name}: must be readable to its end, found: {error or type(error).__name__}."
             ) from error
         if not isinstance(chunk, bytes):
-            raise InputError(f"{name}: must be open in binary mode, found text; open it with 'rb'.")
+            raise _not_binary(name)
         if not chunk:
             return
         yield chunk

@@ -95,7 +95,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
 
     Raises:
         InvalidArgumentError: Seconds or steps are not positive, there is only one camera, no
-            camera sees the full scene, ``frozen`` is out of range, or the seed is no whole number.
+            camera sees the full scene, ``frozen`` is out of range, the seed is no whole number, or
+            the first scene has more Gaussians than the second.
         InvalidSceneError: A scene has no valid row.
         DeviceError: There is no such device.
 
@@ -107,6 +108,11 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         ('perfect', 0.0)
     """
     small, full = as_scene(small, "small"), as_scene(full, "full")
+    if len(small) > len(full):
+        raise InvalidArgumentError(
+            f"small must have at most as many Gaussians as full, found {len(small):,} and "
+            f"{len(full):,}; the simplified scene comes first."
+        )
     config = RefineConfig() if config is None else config
     if not isinstance(config, RefineConfig):
         raise InvalidArgumentError(f"config must be a RefineConfig, found {shown(config)}.")
