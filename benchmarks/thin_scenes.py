@@ -18,7 +18,7 @@ from cvtgs.views import automatic_views
 
 MOMENTS = {"merge.representatives": "false"}
 VARIANTS = {"standard": {}, "moments only": MOMENTS, "paper": {"preset": "paper"}}
-VARIANTS["paper, with members"] = {"preset": "paper", "merge.representatives": "true"}
+VARIANTS["paper, with representatives"] = {"preset": "paper", "merge.representatives": "true"}
 
 
 def main() -> None:
