@@ -51,6 +51,21 @@ def test_a_surface_hides_what_is_behind_it_but_not_what_is_beside_or_before_it()
     assert hidden.tolist() == [True, False, False, False, False, False]
 
 
+def test_nobody_stands_behind_the_walls_of_a_room_that_is_cut_open():
+    steps = torch.linspace(-1.0, 1.0, 41).double()
+    across, up = torch.cartesian_prod(steps, 0.6 * steps).unbind(1)
+    wall = torch.stack([torch.ones_like(across), across, up], dim=1)
+    ahead, aside = torch.cartesian_prod(steps, steps).unbind(1)
+    ceiling = torch.stack([ahead, aside, torch.full_like(ahead, 0.9)], dim=1)
+    room = layout_of(voxels=voxels_at(torch.cat([wall, ceiling])), cutaway=torch.zeros(3).double())
+    before, above = [-2.0, 0.0, 0.3], [-0.8, 0.0, 2.0]
+    behind, over_the_wall = [2.0, 0.0, 0.3], [1.6, 0.0, 1.2]
+    eyes = torch.tensor([before, above, behind, over_the_wall]).double()
+    assert positions.stand_free(room, eyes).tolist() == [True, False, False, False]
+    assert positions.stand_free(replace(room, cutaway=None), eyes).all()
+    assert not layout.are_hidden(eyes[3:], UP * 0.0, wall).any()  # its line passes over the wall
+
+
 def test_a_layout_is_found_from_valid_rows_only():
     scene = random_scene(20)
     means = scene.means.clone()
