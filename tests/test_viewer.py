@@ -2,6 +2,7 @@
 
 import math
 import re
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -360,6 +361,14 @@ def test_a_page_without_the_simplified_scene_is_an_error(
     assert main(["view", str(tmp_path / "a.ply"), "--page", str(tmp_path / "a.html")]) == 1
     assert capsys.readouterr().err == "cvtgs: error: there is no such device.\n"
     assert not (tmp_path / "a.html").exists()
+    assert not viser_stand_in.ViserServer.latest.is_open
+
+
+def test_an_interrupt_is_the_usual_end(tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(ViewerServer, "wait", lambda _: signal.raise_signal(signal.SIGINT))
+    save(random_scene(3), tmp_path / "a.ply")
+    assert main(["view", str(tmp_path / "a.ply"), "--no-browser", "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
     assert not viser_stand_in.ViserServer.latest.is_open
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import webbrowser
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import cvtgs
@@ -138,6 +139,7 @@ def view(options: argparse.Namespace) -> None:
             say(f"{server.address} (end with Ctrl+C)", flush=True)
         if not options.no_browser:
             webbrowser.open(server.address)
-        server.wait()
+        with suppress(KeyboardInterrupt):  # the usual end
+            server.wait()
     finally:
         server.close()
