@@ -51,7 +51,7 @@ def test_a_surface_hides_what_is_behind_it_but_not_what_is_beside_or_before_it()
     assert hidden.tolist() == [True, False, False, False, False, False]
 
 
-def test_nobody_stands_behind_the_walls_of_a_room_that_is_cut_open():
+def test_nobody_stands_behind_the_walls_of_a_room_that_is_open_to_a_side():
     steps = torch.linspace(-1.0, 1.0, 41).double()
     across, up = torch.cartesian_prod(steps, 0.6 * steps).unbind(1)
     wall = torch.stack([torch.ones_like(across), across, up], dim=1)

@@ -29,7 +29,7 @@ was measured. Hollow objects have outer sides, a base and things beside them: 0.
 _BEHIND = 1.3  # a surface over this many times as far, plus one voxel, is behind another
 _FARTHEST = 6.0
 _WALL_RAYS = 24  # level directions in which walls are searched
-_WALLED = 0.4  # least share of them with a wall in a room without a ceiling or other walls
+_WALLED = (0.4, 0.95)  # share of them with a wall in a room that is open to a side
 _REACHED = 0.75  # a line that passes a voxel within this many edges meets its surface
 _MOST_POINTS = 10_000
 _CELLS = 10
@@ -64,7 +64,7 @@ def find_room(
     middle: Float[Tensor, "3"],
     up: Float[Tensor, "3"],
 ) -> tuple[Float[Tensor, "3"] | None, Float[Tensor, "3"] | None]:
-    """Return the eye point of a room, and that of a room cut open, in robust radii, or None."""
+    """Return the eye point of a room, and that of one open to a side, in robust radii, or None."""
     points = voxels.points
     if len(points) == 0:
         return None, None
@@ -88,7 +88,8 @@ def find_room(
     angles = torch.arange(_WALL_RAYS, dtype=points.dtype, device="cpu") * (math.tau / _WALL_RAYS)
     level = angles.cos()[:, None] * right + angles.sin()[:, None] * ahead
     walls = are_hidden(best + _NEAR * level, best, points)
-    return None, best if float(walls.double().mean()) >= _WALLED else None
+    least, most = _WALLED
+    return None, best if least <= float(walls.double().mean()) <= most else None
 
 
 def are_hidden(
@@ -206,7 +207,7 @@ class SceneLayout:
     height: float  # extent along ``up`` of the content near the middle
     floor: float | None  # height along ``up``; None without a floor
     room: Float[Tensor, "3"] | None  # eye point in its middle; None if not seen from inside
-    cutaway: Float[Tensor, "3"] | None  # middle of a room without a ceiling or some of its walls
+    cutaway: Float[Tensor, "3"] | None  # middle of a room that is open to a side, else None
 
     @property
     def subject(self) -> Float[Tensor, "3"]:

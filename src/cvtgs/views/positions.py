@@ -91,10 +91,10 @@ class CameraPositions:
         """Return a mask of the good positions.
 
         A good position is free, above the floor if there is one, and inside the room if the scene
-        is one, else not enclosed. If the room lacks a ceiling or walls, none of the others may hide
-        its middle. Near Gaussians must also be smaller than distant ones, as is usual where images
-        were taken, unless the position faces, from outside, a side of small Gaussians: the smooth
-        back of an object. No position with clutter before the scene may be nearer than one without.
+        is one, else not enclosed. If the room is open to a side, no wall may hide its middle. Near
+        Gaussians must also be smaller than distant ones, as is usual where images were taken,
+        unless the position faces, from outside, a side of small Gaussians: the smooth back of an
+        object. No position with clutter before the scene may be nearer than one without.
 
         Args:
             eyes: Positions, scene units.
@@ -258,9 +258,9 @@ def stand_free(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, 
 def _behind_walls(
     layout: SceneLayout, middle: Float[Tensor, "3"], local: Float[Tensor, "c 3"]
 ) -> Bool[Tensor, "c"]:
-    """Return which positions, in robust radii, are behind the walls of a room that is cut open.
+    """Return which positions, in robust radii, are behind the walls of a room open to a side.
 
-    Images were taken inside or from its open side, not over its walls from behind, so there may be
+    Images were taken inside or from this side, not over its walls from behind, so there may be
     no wall between the middle and a position, nor the position lowered to the height of the middle.
     """
     target, points = layout.frame.normalize(middle[None])[0], layout.voxels.points
