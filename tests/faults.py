@@ -23,6 +23,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import torch
+
 import cvtgs
 import cvtgs.outofcore
 import cvtgs.outofcore.memory
@@ -256,6 +258,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, default=float("inf"), help="end after this time")
     parser.add_argument("--commands", nargs="*", choices=[*COMMANDS], default=[*COMMANDS])
     options = parser.parse_args(arguments)
+    torch.set_num_threads(1)  # a fork of a process whose OpenMP threads have started can hang
     dice, ends, begun = random.Random(options.seed), Counter[str](), time.monotonic()
     names: list[str] = options.commands
     with tempfile.TemporaryDirectory() as place, cluster(names):
