@@ -13,6 +13,7 @@ _UNSAFE = re.compile(
 """Control characters except tab and line feed, direction marks, and lone surrogates."""
 
 MOST_LETTERS = 60  # maximum length of a value in an error message
+SETTING_LIKENESS = 0.82  # least likeness of an unknown setting to the one that is suggested
 
 
 def shortened(text: str, length: int) -> str:

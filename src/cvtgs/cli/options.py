@@ -15,7 +15,7 @@ import cvtgs
 from cvtgs.cli.display import say
 from cvtgs.cli.paths import any_path, new_folder
 from cvtgs.errors import ConfigError, InvalidArgumentError
-from cvtgs.text import suggestion
+from cvtgs.text import SETTING_LIKENESS, suggestion
 
 if TYPE_CHECKING:
     import pydantic
@@ -309,7 +309,7 @@ def read_settings(words: Sequence[str] = (), effects: str | None = None) -> dict
     known = list(_setting_names(cvtgs.SimplifyConfig))
     there = [key.removeprefix("effects.") for key in known if key.startswith("effects.")]
     for key in settings:
-        nearest = "" if key in known else suggestion(key, known, likeness=0.82)
+        nearest = "" if key in known else suggestion(key, known, likeness=SETTING_LIKENESS)
         if key.startswith("effects.") and key not in known and not nearest:
             nearest = f"; there are {', '.join(there)}."
         if nearest:  # otherwise the configuration reports the unknown key

@@ -7,7 +7,7 @@ from pathlib import Path
 _SCENES = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf", ".usda")
 
 FILE_SUFFIXES = (*_SCENES, ".html", ".json", ".csv", ".png", ".jpg")
-"""Suffixes of files that commands write; a new folder with such a name would be a mistake."""
+"""Suffixes of files that commands read or write; a new folder of such a name is a mistake."""
 
 
 def any_path(text: str) -> Path:
@@ -44,6 +44,6 @@ def folder_or_file(text: str) -> Path:
 
 
 def names_file(path: Path) -> bool:
-    """Return whether a path is no folder and ends like a file that commands write."""
+    """Return whether a path is no folder and ends like a file that commands read or write."""
     is_folder = os.path.isdir(path)  # noqa: PTH112 (false for impossible names)
     return path.name.lower().endswith(FILE_SUFFIXES) and not is_folder

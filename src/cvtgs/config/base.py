@@ -2,17 +2,15 @@
 
 import tomllib
 from collections.abc import Sequence
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, ClassVar
 
 import pydantic
 
 from cvtgs.errors import ConfigError
-from cvtgs.text import shortened, shown
+from cvtgs.text import SETTING_LIKENESS, shortened, shown, suggestion
 
 MOST_PROBLEMS = 4  # maximum number of problems that one error message names
-LIKENESS = 0.82  # least likeness of an unknown setting to the one that a message suggests
 
 
 class Record(pydantic.BaseModel):
@@ -121,8 +119,8 @@ def _nearest(model: type[pydantic.BaseModel], path: Sequence[int | str]) -> str:
         if not (isinstance(section, type) and issubclass(section, pydantic.BaseModel)):
             return ""
         model = section
-    near = get_close_matches(name, model.model_fields, n=1, cutoff=LIKENESS)
-    return f"; did you mean {'.'.join([*sections, near[0]])}?" if near else ""
+    known = [".".join([*sections, other]) for other in model.model_fields]
+    return suggestion(".".join([*sections, name]), known, likeness=SETTING_LIKENESS)
 
 
 def named(key: str) -> str:
