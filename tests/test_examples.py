@@ -84,13 +84,13 @@ def test_compare(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_custom_merge_keeps_labels_apart(tmp_path: Path) -> None:
+def test_custom_cells_keeps_labels_apart(tmp_path: Path) -> None:
     scene = cvtgs.synthetic.scene("object", 400, sh_degree=0, seed=0)
     label = (scene.means[:, 0] > scene.means[:, 0].median()).to(torch.int32)
     scene = scene.with_tensors({}, {"label": label, "share": label.to(torch.float32)})
     source, small = tmp_path / "scene.ply", tmp_path / "small.ply"
     cvtgs.save(scene, source)
-    run("custom_merge.py", source, small, "--rho", 0.1)
+    run("custom_cells.py", source, small, "--rho", 0.1)
     merged = cvtgs.load(small)
     assert len(merged) == 40
     assert set(merged.extras["label"].tolist()) == {0, 1}
@@ -99,10 +99,10 @@ def test_custom_merge_keeps_labels_apart(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_custom_merge_needs_a_column(tmp_path: Path) -> None:
+def test_custom_cells_needs_a_column(tmp_path: Path) -> None:
     source = scene_file(tmp_path / "scene.ply")
     with pytest.raises(subprocess.CalledProcessError) as failed:
-        run("custom_merge.py", source, tmp_path / "small.ply")
+        run("custom_cells.py", source, tmp_path / "small.ply")
     assert "must have an extra column of labels, found none\n" in failed.value.stderr
 
 

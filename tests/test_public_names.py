@@ -93,6 +93,7 @@ STAGES = {
     "pipeline": {
         "Merged",
         "Reduced",
+        "group_and_merge",
         "merge_and_inflate",
         "reduce_scene",
     },

@@ -29,7 +29,8 @@ class SceneInfo(Record):
         dtype: float32 or float64.
         bounds: Smallest and largest x, y, z of the centres, scene units.
         robust_center: Median of each coordinate.
-        robust_radius: The 70 % quantile of the distance to ``robust_center``.
+        robust_radius: The 70 % quantile of the distance to ``robust_center``, like this over the
+            Gaussians that renderers draw (an opacity of at least 1/255).
         opacity_quantiles: Opacities at 0, 5, 25, 50, 75, 95 and 100 %.
         mass: Sum of opacity times mean projected area, squared scene units.
         mass_shares: Share of the mass that the heaviest 0.1, 1, 10 and 50 % of Gaussians hold.

@@ -33,7 +33,7 @@ from cvtgs.report import CellStatistics, MatchReport
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities
 
-__all__ = ["Merged", "Reduced", "merge_and_inflate", "reduce_scene"]
+__all__ = ["Merged", "Reduced", "group_and_merge", "merge_and_inflate", "reduce_scene"]
 
 NEIGHBORS = 8
 """Number of neighbouring cells that may cover the ends of a cell, and that the network sees."""
@@ -104,28 +104,16 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
     if target >= len(scene.means):
         return Reduced(standardized(scene) if target < total else with_finite_opacities(scene))
     used = drop_unused_bands(scene, analysis.plan)
-    with clock.stage("filter"):
-        rows, left_out, left_out_mass_share = filter_rows(used, analysis, target, config.filter)
-    with clock.stage("weigh"):
-        points = weigh_rows(used, rows, analysis, config, ordered=ordered)
-        points = with_importance(points, importance)
-    del rows  # frees memory
-    with clock.stage("tessellate", config.cvt.iterations + 1) as advance:
-        tessellation = tessellate_rows(points, analysis, target, config, on_iteration=advance)
-    with clock.stage("allocate"):
-        labels = allocate(points, tessellation, analysis, target, config.allocation)
-        partition = collect_cells(points, labels, target)
-    refilled, energies, energy = tessellation.refilled, tessellation.energies, tessellation.energy
-    del points, labels, tessellation
-    with clock.stage("merge", target) as advance:
-        merged = merge_and_inflate(
-            used,
-            partition,
-            config.merge,
-            areas=analysis.areas,
-            with_network=net is not None and net.sees_surroundings,
-            on_cells=advance,
-        )
+    merged, partition, statistics = group_and_merge(
+        used,
+        analysis,
+        target,
+        config,
+        with_network=net is not None and net.sees_surroundings,
+        clock=clock,
+        ordered=ordered,
+        importance=importance,
+    )
     small = merged.scene
     if net is not None:
         with clock.stage("network", target) as advance:
@@ -139,7 +127,59 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
                 pixel_size=analysis.frame.radius / config.merge.image_size,
                 on_cells=advance,
             )
-    small = restore_columns(standardized(small), scene, analysis.plan)
+    return Reduced(
+        restore_columns(standardized(small), scene, analysis.plan), statistics, partition
+    )
+
+
+def group_and_merge(
+    scene: GaussianScene,
+    analysis: SceneAnalysis,
+    target: int,
+    config: SimplifyConfig,
+    *,
+    with_network: bool,
+    clock: StageClock,
+    ordered: OrderedRows | None = None,
+    importance: Float[Tensor, "n"] | None = None,
+) -> tuple[Merged, cells.Partition, CellStatistics]:
+    """Run the stages before the network: filter, weigh, tessellate, allocate, merge.
+
+    Args:
+        scene: The Gaussians, without bands that the plan drops; more than ``target`` of them.
+        analysis: Their analysis.
+        target: Number of Gaussians to keep.
+        config: The configuration.
+        with_network: Whether a network needs the neighbours.
+        clock: Measures each stage.
+        ordered: As for :func:`reduce_scene`.
+        importance: As for :func:`reduce_scene`.
+
+    Returns:
+        One Gaussian per cell, the rows that make up every cell, and statistics.
+    """
+    with clock.stage("filter"):
+        rows, left_out, left_out_mass_share = filter_rows(scene, analysis, target, config.filter)
+    with clock.stage("weigh"):
+        points = weigh_rows(scene, rows, analysis, config, ordered=ordered)
+        points = with_importance(points, importance)
+    del rows  # frees memory
+    with clock.stage("tessellate", config.cvt.iterations + 1) as advance:
+        tessellation = tessellate_rows(points, analysis, target, config, on_iteration=advance)
+    with clock.stage("allocate"):
+        labels = allocate(points, tessellation, analysis, target, config.allocation)
+        partition = collect_cells(points, labels, target)
+    refilled, energies, energy = tessellation.refilled, tessellation.energies, tessellation.energy
+    del points, labels, tessellation
+    with clock.stage("merge", target) as advance:
+        merged = merge_and_inflate(
+            scene,
+            partition,
+            config.merge,
+            areas=analysis.areas,
+            with_network=with_network,
+            on_cells=advance,
+        )
     statistics = CellStatistics(
         filtered_count=left_out,
         filtered_mass_share=left_out_mass_share,
@@ -150,7 +190,7 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
         energy=energy,
         backend=search_name(scene.device),
     )
-    return Reduced(small, statistics, partition)
+    return merged, partition, statistics
 
 
 def merge_and_inflate(

@@ -9,7 +9,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from cvtgs.analysis import SceneAnalysis, analyze, drop_unused_bands, restore_columns
-from cvtgs.analysis.analyze import measure_visibility
+from cvtgs.analysis.analyze import measure_contributions
 from cvtgs.analysis.effects import drop_mip_tag, select_columns
 from cvtgs.boxes import MaskLike, check_room, checked_mask
 from cvtgs.cameras import Cameras, checked_cameras
@@ -53,8 +53,8 @@ class Prepared:
     """A scene to simplify repeatedly; results that do not depend on the count are cached.
 
     From the second run or ``warm_up`` on, 160 more bytes per Gaussian are cached (up to 256 with
-    view-dependent colour), and another 48 once such a run keeps more than an eighth of the
-    Gaussians.
+    view-dependent colour), and another 48 once such a run merges pairs of single Gaussians
+    (``standard`` above a ratio of 0.031).
 
     ``Simplifier.prepare`` creates instances. Every run gives the bits of ``Simplifier.run``; the
     report of the first run includes the shared stages.
@@ -242,7 +242,7 @@ class Prepared:
         if not is_whole:
             if analysis.plan.visibility.active:
                 with clock.stage("visibility"):
-                    analysis = measure_visibility(
+                    analysis = measure_contributions(
                         valid, analysis, self._config, cameras=self._cameras
                     )
             self._analysis = analysis

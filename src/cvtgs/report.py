@@ -76,11 +76,12 @@ class CellStatistics(Record):
         single_member_cells: Number of cells that keep one Gaussian unchanged: their only member,
             or a representative.
         largest_cell: Number of members of the largest cell.
-        refilled_cells: Number of cells that were empty after Lloyd and took a Gaussian from
-            another.
+        refilled_cells: Number of cells of the tessellation that were empty after Lloyd and took a
+            Gaussian from another.
         energies: Energy of the tessellation before every Lloyd iteration, over the Gaussians that
             Lloyd samples, in squared robust radii.
-        energy: Energy of the final cells, over all Gaussians.
+        energy: Energy of the tessellation, over all Gaussians, before pairs of its cells merge. 0
+            if it has a cell for each Gaussian (``standard`` above a ratio of 0.031).
         backend: Name of the nearest-site search.
     """
 

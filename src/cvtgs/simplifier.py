@@ -26,7 +26,8 @@ class Simplifier:
     Args:
         ckpt: MergeNet checkpoint: ``standard`` or ``paper``, which come with the package, or a
             file. ``auto`` takes the shipped one that fits the preset of the configuration;
-            None or ``none`` merges by moments alone.
+            None or ``none`` merges by moments alone. A network corrects the cells of the preset
+            that it was trained on; with a configuration of another one, results are untested.
         config: A configuration, or the name of a preset; None takes the preset of the checkpoint.
         preset: The name of a preset, instead of a configuration.
         device: Any torch device, or ``auto``: the device of the scene, but CUDA, if available, for

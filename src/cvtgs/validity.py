@@ -144,7 +144,7 @@ def writable_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
 
 
 def with_finite_opacities(scene: GaussianScene) -> GaussianScene:
-    """Replace infinite opacity logits, which are valid input, by the largest finite ones."""
+    """Replace infinite opacity logits, which are valid input, by those of 1e-6 and 1 - 1e-6."""
     logits = scene.logit_opacities
     infinite = logits.isinf()
     if not bool(infinite.any()):

@@ -9,7 +9,7 @@ import torch
 import cvtgs
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig, filters, pipeline
 from cvtgs.analysis import analyze
-from cvtgs.analysis.analyze import measure_visibility
+from cvtgs.analysis.analyze import measure_contributions
 from cvtgs.cells import features
 from cvtgs.cvt import nearest_site
 from cvtgs.math.frames import RobustFrame
@@ -233,7 +233,7 @@ def test_extra_columns_are_kept_unless_the_effect_is_off():
 
 
 def test_no_image_is_rendered_unless_the_preset_asks(monkeypatch):
-    monkeypatch.setattr("cvtgs.prepared.measure_visibility", refuse)
+    monkeypatch.setattr("cvtgs.prepared.measure_contributions", refuse)
     scene = random_scene(100)
     run_with(scene)
     run_with(scene, visibility={"views": 4}, effects={"visibility": "off"})
@@ -267,7 +267,7 @@ def test_images_decide_on_haze_by_the_mass_that_they_show():
     logits = scene.logit_opacities.index_fill(0, torch.arange(50), -5.4)
     scene = scene.with_tensors({"logit_opacities": logits}, {})
     before = analyze(scene, config)
-    found = measure_visibility(scene, before, config, cameras=ring(2))
+    found = measure_contributions(scene, before, config, cameras=ring(2))
     areas, shares = found.apparent_areas, []
     for values in (areas * found.opacities, areas):
         shares.append(float(values[:50].sum() / values.sum()))

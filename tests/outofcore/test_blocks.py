@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import cvtgs
-from cvtgs import Simplifier, SimplifyConfig
+from cvtgs import Simplifier, SimplifyConfig, grouping
 from cvtgs.boxes import Box
 from cvtgs.cli.main import main
 from cvtgs.counts import shared_out
@@ -156,6 +156,23 @@ def test_one_block_gives_the_same_bits_as_a_run_in_one_piece(scene, source, tmp_
     with one_thread():
         whole = Simplifier(device="cpu").simplify(cvtgs.load(source), 0.05)
     assert same_bits(cvtgs.load(tmp_path / "out.ply"), whole)
+
+
+def test_costs_are_those_of_a_run_in_one_piece(scene, tmp_path, monkeypatch):
+    """Their weights depend on the ratio of cells to Gaussians that are not too faint to keep."""
+    ratios = []
+
+    def noted(ratio, config):
+        ratios.append(ratio)
+        return grouping.allocation_at(ratio, config)
+
+    monkeypatch.setattr("cvtgs.outofcore.allocate.allocation_at", noted)
+    faint = torch.arange(6000) % 2 == 0
+    logits = torch.where(faint, -5.6, scene.logit_opacities)  # an opacity of 0.0037
+    cvtgs.save(scene.with_tensors({"logit_opacities": logits}), tmp_path / "in.ply")
+    report = simplify_file(tmp_path / "in.ply", tmp_path / "out.ply", 0.05, blocks=2)
+    assert report.filtered_count > 2000
+    assert set(ratios) == {300 / (6000 - report.filtered_count)}
 
 
 @pytest.mark.slow

@@ -57,6 +57,8 @@ def test_few_gaussians_get_more_steps_of_fewer_pixels(count, thinning, times):
     assert (found.steps, found.half_after) == (round(10 * times), round(20 * times))
     assert (found.check_every, found.steps_per_image) == (round(5 * times), round(times))
     assert found.rates == config.rates
+    twice = config.model_copy(update={"lengthening": 2.0})
+    assert (twice.thinning(count), twice.for_count(count).steps) == (thinning, 10 * min(times, 2))
     never = config.model_copy(update={"lengthening": 1.0})
     assert never.thinning(count) == 1
     assert never.for_count(count) == never

@@ -7,7 +7,7 @@ import cvtgs
 from baseline_cases import gaussians
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.analysis import analyze
-from cvtgs.analysis.analyze import measure_visibility
+from cvtgs.analysis.analyze import measure_contributions
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.rendering import blending_weights, contributions, error_shares, observe, render
@@ -181,7 +181,7 @@ def test_images_that_show_nothing_change_nothing():
     )
     seeing = SimplifyConfig.compose(settings={"visibility.views": "4"})
     estimated = analyze(scene, seeing)
-    measured = measure_visibility(scene, estimated, seeing, cameras=away)
+    measured = measure_contributions(scene, estimated, seeing, cameras=away)
     assert torch.equal(measured.apparent_areas, estimated.apparent_areas)
 
 

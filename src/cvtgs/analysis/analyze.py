@@ -261,7 +261,7 @@ def _windows(slab: Float[Tensor, "a b c"], axis: int) -> Float[Tensor, "d e f"]:
     return sums
 
 
-def measure_visibility(
+def measure_contributions(
     scene: GaussianScene,
     analysis: SceneAnalysis,
     config: SimplifyConfig,

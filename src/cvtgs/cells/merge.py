@@ -29,7 +29,7 @@ CHUNK_MEMBERS = 1 << 15
 """Members per chunk, each of about ``(60 + 6 k) * 8`` bytes, with k coefficients in ``shN``."""
 
 OPAQUE = -math.log(0.01)
-"""Optical depth of an opacity of 0.99, the largest that rasterizers paint at a pixel."""
+"""Optical depth of an opacity of 0.99, the largest that 3DGS paints at a pixel."""
 
 DOMINANT = 0.99  # a member with more than this share of the mass of its cell represents it
 

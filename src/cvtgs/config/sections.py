@@ -14,7 +14,7 @@ Ridge = Annotated[float, pydantic.Field(ge=1e-9, le=1e9)]  # products of two fit
 Choice = Literal["auto", "on", "off"]
 Less = Literal["auto", "off"]
 
-LEAST_LENGTHENING = 2.5  # with a smaller factor, steps on fewer pixels gain nothing
+LEAST_LENGTHENING = 2.5  # pixels per Gaussian, along a side, from which on steps need fewer
 _IN_STEPS = ("steps", "half_after", "check_every", "steps_per_image")  # settings of a refinement
 
 
@@ -297,8 +297,8 @@ class RefineConfig(ImageSection):
         lengthening: Largest factor of the number of steps for few Gaussians, which are large and
             need fewer pixels and more steps. If a square image has r * r pixels for each, and r is
             at least 2.5, a step uses only every second pixel along rows and columns, and
-            ``steps``, ``half_after``, ``check_every`` and ``steps_per_image`` are r times as large.
-            1 for never.
+            ``steps``, ``half_after``, ``check_every`` and ``steps_per_image`` are r times as large,
+            or this many times if that is less. 1 for never.
 
     Example:
         >>> RefineConfig(size=128).rates.means
@@ -349,9 +349,9 @@ class RefineConfig(ImageSection):
         )
 
     def _times(self, count: int) -> float:
-        """Return the factor of the number of steps: 1, or at least :data:`LEAST_LENGTHENING`."""
-        times = min(self.size / (self.stride * math.sqrt(count)), self.lengthening)
-        return times if times >= LEAST_LENGTHENING else 1.0
+        """Return the factor of the number of steps."""
+        side = self.size / (self.stride * math.sqrt(count))  # pixels for each Gaussian along a side
+        return min(side, self.lengthening) if side >= LEAST_LENGTHENING else 1.0
 
     def new_images(self, steps: int, *, shared: int = 0) -> int:
         """Return the number of images of the full scene that some steps render, if available.

@@ -2,7 +2,7 @@
 
 Sites are split into the leaves of a k-d tree, and points into tiles, runs of points along the
 leaves. A tile is compared with all sites of the leaves that may hold a nearest one, in one matrix
-product. That is some hundred comparisons per point, whatever the number of sites, in few launches.
+product. That is some 500 comparisons per point, whatever the number of sites, in few launches.
 """
 
 import math

@@ -38,7 +38,8 @@ MARGIN = 0.1  # corrections fade to zero beyond the range over this share of its
 NARROWEST = 0.01  # smallest width of this fade, for features that did not vary in training
 
 MEMBERS, MOST_MEMBERS = 9, 2000
-"""Index of the feature ``0.2 log(members)``, and the largest number of members that is corrected.
+"""Index of the feature ``0.2 log(members)``, and the number of members from which on it is outside
+the known range, so that corrections fade.
 
 Larger cells occur in the middle of unbounded scenes where most cells are spent on the sky. They
 cover the cameras when they grow, so the limit holds whatever the training cases contain.
@@ -76,7 +77,8 @@ class Residuals:
     Attributes:
         d_means: ``(m, 3)`` moves of the centres, in the frame and the standard deviations of each.
         d_log_scales: ``(m, 3)`` changes of the log scales.
-        d_rotvecs: ``(m, 3)`` rotation vectors in the frame of each, radians.
+        d_rotvecs: ``(m, 3)`` rotation vectors v in the frame of each; the angle is
+            ``2 atan(|v| / 2)`` radians, which is nearly ``|v|`` here.
         d_logit_opacities: ``(m,)`` changes of the opacity logits.
         member_colors: ``(n,)`` shares of the members' colour differences to add.
         pair_colors: ``(m, k)`` shares of the neighbours' colour differences to add.
@@ -322,8 +324,8 @@ class KnownRange(nn.Module):
         """Set the range from the cells of the training cases.
 
         Tails are cut case by case, however few cells a case has; the range of a feature then goes
-        from the smallest to the largest remaining value of all cases. Cells of more than
-        ``MOST_MEMBERS`` members are never within it.
+        from the smallest to the largest remaining value of all cases, that of the members at most
+        to ``MOST_MEMBERS``.
 
         Args:
             cases: Summaries of the cells of every case, at least one case.

@@ -135,8 +135,8 @@ def _allocate_region(
 
 def _costs(job: Job) -> AllocationConfig:
     """Return the costs of merging at the ratio of the whole scene."""
-    ratio = job.read_manifest().total / job.read_scan().row_count
-    return allocation_at(ratio, job.config.allocation)
+    manifest = job.read_manifest()
+    return allocation_at(manifest.total / manifest.grouped, job.config.allocation)
 
 
 def _add_parts(job: Job, region: Sequence[int], cell_counts: Sequence[int]) -> Moments:

@@ -59,6 +59,7 @@ class Manifest(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
     key: str  # digest of everything that the result depends on
+    grouped: int  # Gaussians that the filter leaves to group
     total: int  # Gaussians that all blocks keep together
     cells: tuple[int, ...]  # of the tessellation in each block; their sum is at least ``total``
     left_out_mass: float  # of the Gaussians that the filter leaves out

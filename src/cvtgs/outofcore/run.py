@@ -232,6 +232,7 @@ def _scan_and_sort(job: Job, key: str, workers: Workers, clock: StageClock) -> M
         cells = shared_out(finer, found.cells, rooms=found.rows)
     return Manifest(
         key=key,
+        grouped=total,
         total=found.rest,
         cells=tuple(cells),
         left_out_mass=found.left_out_mass,

@@ -169,7 +169,7 @@ def observe_in_two_passes(
 class PixelWeights:
     """The blending weights of one image; see :class:`cvtgs.rendering.BlendingWeights`.
 
-    Memory: 40 bytes per pair of splat and reached pixel, and as much again for a product.
+    Memory: 24 bytes per pair of splat and reached pixel, and about as much again for a product.
     """
 
     def __init__(

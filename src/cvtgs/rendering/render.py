@@ -65,11 +65,11 @@ def render(
 ) -> Rendering:
     """Render a scene by the rules of 3DGS (Kerbl et al. 2023).
 
-    EWA projection dilates Gaussians by 0.3 squared pixels. Alpha is at most 0.99, alpha under 1/255
-    is skipped, and blending runs front to back until the transmittance would fall under 1e-4.
-    Scenes tagged ``SplatRenderMode: mip`` get the opacity compensation of Mip-Splatting (Yu et al.
-    2024). 3DGS cuts Gaussians at three standard deviations, rounded up to tiles; here they end
-    where alpha falls under 1/255, so images do not depend on tiles.
+    EWA projection dilates Gaussians by 0.3 squared pixels. Alpha is at most 0.99 (0.999 by
+    gsplat), alpha under 1/255 is skipped, and blending runs front to back until the transmittance
+    would fall under 1e-4. Scenes tagged ``SplatRenderMode: mip`` get the opacity compensation of
+    Mip-Splatting (Yu et al. 2024). 3DGS cuts Gaussians at three standard deviations, rounded up to
+    tiles; here they end where alpha falls under 1/255, so images do not depend on tiles.
 
     Images are differentiable with respect to means, quats, log scales, opacity logits, sh0, shN and
     the background; cameras are constants. Gaussians with a non-finite position, shape or opacity

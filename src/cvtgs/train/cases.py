@@ -10,20 +10,20 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.analysis import analyze, drop_unused_bands
-from cvtgs.analysis.analyze import measure_visibility
+from cvtgs.analysis.analyze import measure_contributions
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Descriptors, Partition, describe_cells
+from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import target_count
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation.scorer import ViewImages, render_views
-from cvtgs.filters import filter_rows
-from cvtgs.grouping import allocate, collect_cells, tessellate_rows, weigh_rows
 from cvtgs.io import load_cameras
 from cvtgs.mergenet import MergeNet, Net, Residuals, compose
 from cvtgs.mergenet.apply import compose_published
 from cvtgs.mergenet.published import describe_published
-from cvtgs.pipeline import merge_and_inflate
+from cvtgs.pipeline import group_and_merge
+from cvtgs.progress import silent
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import check_rows
 from cvtgs.views import mixed_views
@@ -52,16 +52,10 @@ def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> Me
         )
     analysis = analyze(valid, config, with_visibility=True)
     if analysis.plan.visibility.active:
-        analysis = measure_visibility(valid, analysis, config)
+        analysis = measure_contributions(valid, analysis, config)
     valid = drop_unused_bands(valid, analysis.plan)
-    rows = filter_rows(valid, analysis, target, config.filter).rows
-    points = weigh_rows(valid, rows, analysis, config)
-    tessellation = tessellate_rows(points, analysis, target, config)
-    labels = allocate(points, tessellation, analysis, target, config.allocation)
-    partition = collect_cells(points, labels, target)
-    merged = merge_and_inflate(
-        valid, partition, config.merge, areas=analysis.areas, with_network=True
-    )
+    clock = StageClock(silent, valid.device)
+    merged = group_and_merge(valid, analysis, target, config, with_network=True, clock=clock)[0]
     return MergedScene(valid, *merged, analysis.visibility, analysis.frame.radius)
 
 

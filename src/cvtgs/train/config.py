@@ -103,7 +103,7 @@ class TrainConfig(Section):
         steps: Number of training steps.
         cases_per_step: Number of scenes, each at one ratio, whose gradients are averaged in a step.
             On a CPU, processes on all cores share them.
-        learning_rate: Largest learning rate of AdamW; it falls to zero along a cosine.
+        learning_rate: Largest learning rate of Adam; it falls to zero along a cosine.
         restart_step: Step at which the learning rate rises again, to fall a second time until the
             last step; 0 for one fall only. With its number of steps here, and more steps, a
             finished training can be resumed.

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+import cvtgs
 from cvtgs import synthetic
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Descriptors, Partition
@@ -244,7 +245,7 @@ def prepare_scene(source: Source, config: TrainConfig, folder: Path) -> Training
 
 
 def _key(source: Source, *parts: Any) -> str:
-    text = json.dumps([CACHE_VERSION, source.identity, *parts], sort_keys=True)
+    text = json.dumps([cvtgs.__version__, CACHE_VERSION, source.identity, *parts], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -23,7 +23,7 @@ __all__ = ["SceneViewer", "ShownScene"]
 
 FULL, SIMPLIFIED = "full scene", "simplified"
 
-WARM_RATIO = 0.5  # largest ratio to prepare for: above an eighth, pairs of single Gaussians merge
+WARM_RATIO = 0.5  # largest ratio to prepare for: above 0.031, pairs of single Gaussians merge
 SCORE_SIDE, LEAST_SIDE = 480, 16  # longer side of scored images, and least of the other, pixels
 
 

@@ -1,6 +1,6 @@
-"""Define your own merge rule: cells never span several labels, so objects stay separate.
+"""Define your own cells: they never span several labels, so objects stay separate.
 
-python examples/custom_merge.py labelled.ply small.ply --column label --rho 0.05
+python examples/custom_cells.py labelled.ply small.ply --column label --rho 0.05
 
 The stages are functions. This example adds a coordinate to the space of the tessellation, so that
 Gaussians of different labels are far apart. Each cell is merged by moments.
