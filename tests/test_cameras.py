@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -38,12 +39,12 @@ GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "h
             "viewmats must be a tensor of floats of shape (c, 4, 4), "
             "found torch.float32 of shape (4, 4).",
         ),
-        ({"strides": 5}, "strides must hold one stride per camera, 1; found 5."),
-        ({"ignores_tag": 5}, "ignores_tag must hold one choice per camera, 1; found 5."),
+        ({"strides": 5}, "strides must be a tuple of type int, found 5."),
+        ({"ignores_tag": 5}, "ignores_tag must be a tuple of type bool, found 5."),
         ({"width": 0}, "width must be a whole number above 0, found 0."),
         ({"height": 2.5}, "height must be a whole number above 0, found 2.5."),
         ({"strides": (0,)}, "every stride must be a whole number above 0, found 0."),
-        ({"strides": (2, 2)}, "strides must hold one stride per camera, 1; found 2."),
+        ({"strides": (2, 2)}, "strides must hold one entry per camera, 1; found 2."),
         (
             {"width": torch.tensor(2.5)},
             "width must be a whole number above 0, found tensor(2.5000).",
@@ -52,10 +53,13 @@ GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "h
             {"viewmats": torch.eye(4)[None].numpy()},
             "viewmats must be a tensor of floats of shape (c, 4, 4), found ndarray.",
         ),
-        ({"names": ("a", "b")}, "names must hold one name per camera, 1; found 2."),
+        ({"names": ("a", "b")}, "names must hold one entry per camera, 1; found 2."),
+        ({"names": "a"}, "names must be a tuple of type str, found 'a'."),
+        ({"names": (1,)}, "names must be a tuple of type str, found (1,)."),
+        ({"ignores_tag": ("no",)}, "ignores_tag must be a tuple of type bool, found ('no',)."),
         (
             {"ignores_tag": (True, False)},
-            "ignores_tag must hold one choice per camera, 1; found 2.",
+            "ignores_tag must hold one entry per camera, 1; found 2.",
         ),
     ],
 )
@@ -134,7 +138,9 @@ def test_interleaved_cameras_start_at_their_own_first_pixels():
 
 def test_cameras_are_selected_by_rows_and_by_masks():
     views = torch.eye(4).repeat(3, 1, 1) * torch.tensor([1.0, 2, 3])[:, None, None]
-    three = Cameras(**GOOD | {"viewmats": views, "Ks": torch.eye(3).repeat(3, 1, 1)}, names="abc")
+    three = Cameras(
+        **GOOD | {"viewmats": views, "Ks": torch.eye(3).repeat(3, 1, 1)}, names=("a", "b", "c")
+    )
     for rows in (torch.tensor([0, 2]), torch.tensor([True, False, True]), [0, -1]):
         found = three.select(rows)
         assert (found.names, found.viewmats[:, 0, 0].tolist()) == (("a", "c"), [1, 3])
@@ -142,6 +148,16 @@ def test_cameras_are_selected_by_rows_and_by_masks():
         three.select(torch.tensor([True, False]))
     with pytest.raises(InvalidArgumentError, match="must be from -3 to 2, found 3"):
         three.select(torch.tensor([3]))
+
+
+def test_sizes_may_be_numbers_of_numpy_and_torch():
+    cameras = Cameras(**GOOD | {"width": torch.tensor(8), "height": np.int64(6)}, strides=[2])
+    assert (type(cameras.width), type(cameras.height)) == (int, int)
+    assert cameras.strides == (2,)
+    assert cameras.fitted(torch.tensor(4)).width == 4
+    strided = cameras.every(torch.tensor(2))
+    assert (strided.width, strided.height, strided.strides) == (4, 3, (4,))
+    assert type(strided.strides[0]) is int
 
 
 @pytest.mark.parametrize(

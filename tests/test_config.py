@@ -7,7 +7,7 @@ import pytest
 
 from cvtgs import PRESETS, SimplifyConfig
 from cvtgs.config import FilterConfig, MergeConfig, RefineConfig, TessellationConfig
-from cvtgs.errors import ConfigError
+from cvtgs.errors import ConfigError, InvalidArgumentError
 
 
 def error_of(values: dict[str, object]) -> str:
@@ -321,3 +321,28 @@ def test_settings_reach_nested_sections():
         SimplifyConfig.compose(settings={"refine.rates.colour": "1"})
     with pytest.raises(ConfigError, match=r"refine\.steps\.most: is not a known setting"):
         SimplifyConfig.compose(settings={"refine.steps": "3", "refine.steps.most": "1"})
+
+
+@pytest.mark.parametrize("values", [None, [1], "x"])
+def test_what_is_no_mapping_is_refused(values):
+    with pytest.raises(ConfigError, match="a configuration must be a mapping, found"):
+        SimplifyConfig.from_mapping(values)
+
+
+@pytest.mark.parametrize("settings", [["cvt.iterations=10"], {5: "10"}, "cvt.iterations=10"])
+def test_settings_must_be_texts_by_key(settings):
+    with pytest.raises(ConfigError, match="settings must be texts by dotted key, found"):
+        SimplifyConfig.compose(settings=settings)
+
+
+@pytest.mark.parametrize("path", [None, 5, b"x", {}, ""])
+def test_a_file_must_be_a_path(path):
+    with pytest.raises(InvalidArgumentError, match="a path must"):
+        SimplifyConfig.from_toml(path)
+
+
+def test_presets_cannot_be_changed():
+    with pytest.raises(TypeError, match="does not support item assignment"):
+        PRESETS["fast"]["seed"] = 5
+    with pytest.raises(TypeError, match="does not support item assignment"):
+        PRESETS["matched"]["refine"]["rates"]["means"] = 1.0

@@ -149,13 +149,13 @@ def test_merge_keeps_all_rows() -> None:
 def test_merge_widens_unlike_scenes_and_warns() -> None:
     first = replace(labelled(4, degree=0), comments=("SplatRenderMode: mip",))
     second = random_scene(3, degree=3, dtype=torch.float64)
-    with pytest.warns(UserWarning, match="of the scenes to merge") as said:
+    with pytest.warns(UserWarning, match="of the scenes to") as said:
         both = merge([first, second])
     assert [one.category for one in said] == [DroppedDataWarning, UserWarning]
     assert [str(one.message) for one in said] == [
         "left out column 'label', which not all of the scenes to merge have.",
-        "some of the scenes to merge were trained with anti-aliasing and others were not; viewers "
-        "will show the latter too soft.",
+        "some of the scenes to join are tagged SplatRenderMode: mip and others are not; viewers "
+        "will show one of the two kinds too soft or too sharp.",
     ]
     assert {one.filename for one in said} == {__file__}
     assert (both.sh_degree, both.dtype, dict(both.extras)) == (3, torch.float64, {})

@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -99,10 +100,11 @@ def test_no_ratio_and_bad_ratios_are_refused(scene, simplifier):
 def test_the_index_describes_the_files(scene, simplifier, tmp_path):
     folder = tmp_path / "levels"
     index = write_levels(
-        simplifier.levels(scene, RHOS), folder, rhos=RHOS, source="scene.ply", suffix=".ply"
+        simplifier.levels(scene, RHOS), folder, rhos=RHOS, source=Path("scene.ply"), suffix=".ply"
     )
     read = LevelsIndex.model_validate_json((folder / "levels.json").read_text())
     assert read == index
+    assert read.source == "scene.ply"
     assert [level.file for level in read.levels] == list(level_names(RHOS))
     for level in read.levels:
         small = cvtgs.load(folder / level.file)
@@ -117,7 +119,13 @@ def test_the_index_describes_the_files(scene, simplifier, tmp_path):
 def test_wrong_arguments_are_refused_before_files_are_written(scene, simplifier, tmp_path):
     levels = simplifier.levels(scene, [0.01, 0.02])
     for those, rhos, message in (
-        ([], [], "levels to write must be at least one, found none"),
+        ([], [], r"those that Simplifier\.levels returns, found \[\]"),
+        ([scene], [0.01], r"those that Simplifier\.levels returns, found \[GaussianScene"),
+        (
+            [*levels, *simplifier.levels(scene[:1000], [0.03])],
+            [0.01, 0.02, 0.03],
+            "must be of one scene, found scenes of 1,000 and 3,000 Gaussians",
+        ),
         (levels, [0.01], r"rhos must hold one ratio per level, 2; found 1\."),
         (levels, [0.01, 0.01], r"rhos must differ, since they name the files, found 0\.01 twice"),
         (levels, [0.01, -3], r"rho must be above 0 and at most 1; found -3\."),

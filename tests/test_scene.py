@@ -5,6 +5,7 @@ import dataclasses
 import math
 import pickle
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -347,12 +348,27 @@ def test_scenes_are_joined_in_their_order():
 def test_scenes_that_do_not_match_are_not_joined():
     scene = random_scene(3)
     labelled = scene.with_tensors({}, {"label": torch.arange(3)})
-    with pytest.raises(InvalidSceneError, match="same extra columns"):
+    with pytest.raises(InvalidSceneError, match=r"must be alike.*, scene 1 .*columns .'label"):
         cvtgs.concatenate([scene, labelled])
-    with pytest.raises(InvalidSceneError, match="same SH degree"):
+    with pytest.raises(InvalidSceneError, match=r"has SH degree 0, .*, scene 1 SH degree 1,"):
         cvtgs.concatenate([random_scene(3, degree=0), random_scene(3, degree=1)])
     with pytest.raises(InvalidSceneError, match="at least one scene"):
         cvtgs.concatenate([])
+
+
+def test_joining_tagged_and_other_scenes_warns():
+    scene = random_scene(3)
+    tagged = replace(scene, comments=("SplatRenderMode: mip",))
+    with pytest.warns(UserWarning, match="some of the scenes to join are tagged SplatRenderMode"):
+        cvtgs.concatenate([scene, tagged])
+
+
+def test_layouts_hold_pairs_and_tensors_have_names():
+    for layout in (5, ("abc",), (1, 2)):
+        with pytest.raises(InvalidSceneError, match="layout must be a tuple of pairs, found"):
+            replace(random_scene(3), layout=layout)
+    with pytest.raises(InvalidSceneError, match="tensors must be a mapping by name, found"):
+        random_scene(3).with_tensors(torch.zeros(3))
 
 
 def test_with_tensors_takes_keywords_and_keeps_extras():

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from cvtgs.cameras import Cameras
     from cvtgs.config import PRESETS, SimplifyConfig
     from cvtgs.counts import target_count
+    from cvtgs.edit import concatenate
     from cvtgs.errors import CvtgsError
     from cvtgs.evaluation import evaluate
     from cvtgs.info import SceneInfo, describe
@@ -53,7 +54,7 @@ if TYPE_CHECKING:
     from cvtgs.refinement import refine
     from cvtgs.rendering import Rendering, render
     from cvtgs.report import Level, Simplified, SimplifyReport
-    from cvtgs.scene import GaussianScene, concatenate
+    from cvtgs.scene import GaussianScene
     from cvtgs.simplifier import Simplifier, simplify
 
 __version__ = "0.2.0"
@@ -79,7 +80,7 @@ _HOME = {
     "Rendering": "cvtgs.rendering",
     "SimplifyReport": "cvtgs.report",
     "GaussianScene": "cvtgs.scene",
-    "concatenate": "cvtgs.scene",
+    "concatenate": "cvtgs.edit",
     "Level": "cvtgs.report",
     "Prepared": "cvtgs.prepared",
     "Simplified": "cvtgs.report",

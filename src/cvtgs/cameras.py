@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.checks import check_kinds, checked, row_numbers
-from cvtgs.counts import check_whole, spread_rows, whole_number
+from cvtgs.counts import checked_whole, spread_rows, whole_number
 from cvtgs.devices import usable_device, without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.frames import unit_vectors
@@ -63,19 +63,21 @@ class Cameras:
                 f"{self.viewmats.device} and {self.Ks.dtype} on {self.Ks.device}."
             )
         for name in ("width", "height"):
-            check_whole(getattr(self, name), name)
-        for name, values, entry in (
-            ("names", self.names, "name"),
-            ("strides", self.strides, "stride"),
-            ("ignores_tag", self.ignores_tag, "choice"),
-        ):
-            if not isinstance(values, Sequence) or len(values) not in (0, count):
-                found = len(values) if isinstance(values, Sequence) else shown(values)
+            object.__setattr__(self, name, checked_whole(getattr(self, name), name))
+        for name, kind in (("names", str), ("strides", int), ("ignores_tag", bool)):
+            values = getattr(self, name)
+            is_list = isinstance(values, Sequence) and not isinstance(values, str)
+            if is_list and kind is int:
+                values = tuple(checked_whole(value, "every stride") for value in values)
+            if not is_list or not all(isinstance(value, kind) for value in values):
                 raise InvalidArgumentError(
-                    f"{name} must hold one {entry} per camera, {count}; found {found}."
+                    f"{name} must be a tuple of type {kind.__name__}, found {shown(values)}."
                 )
-        for stride in self.strides:
-            check_whole(stride, "every stride")
+            if len(values) not in (0, count):
+                raise InvalidArgumentError(
+                    f"{name} must hold one entry per camera, {count}; found {len(values)}."
+                )
+            object.__setattr__(self, name, tuple(values))
 
     def __repr__(self) -> str:
         """Return number, image size and device, not the matrices."""
@@ -157,8 +159,8 @@ class Cameras:
         Raises:
             InvalidArgumentError: A length is no whole number above 0.
         """
-        check_whole(width, "width")
-        check_whole(height, "height")
+        width = checked_whole(width, "width")
+        height = checked_whole(height, "height")
         factors = self.Ks.new_tensor([width / self.width, height / self.height, 1.0])
         return replace(self, Ks=self.Ks * factors[:, None], width=width, height=height)
 
@@ -175,8 +177,8 @@ class Cameras:
         Raises:
             InvalidArgumentError: A length is no whole number above 0.
         """
-        check_whole(side, "side")
-        check_whole(least, "least")
+        side = checked_whole(side, "side")
+        least = checked_whole(least, "least")
         factor = side / max(self.width, self.height)
         return self.resized(
             max(least, round(factor * self.width)), max(least, round(factor * self.height))
@@ -198,7 +200,7 @@ class Cameras:
         Raises:
             InvalidArgumentError: The stride is no whole number above 0, or ``first`` does not fit.
         """
-        check_whole(stride, "stride")
+        stride = checked_whole(stride, "stride")
         starts = tuple(map(whole_number, first)) if isinstance(first, Sequence) else ()
         if len(starts) != 2 or not all(0 <= start < stride for start in starts):
             raise InvalidArgumentError(
@@ -222,7 +224,7 @@ class Cameras:
         Raises:
             InvalidArgumentError: The stride is no whole number above 0.
         """
-        check_whole(stride, "stride")
+        stride = checked_whole(stride, "stride")
         if stride == 1:
             return self
         rows = torch.arange(len(self), device=self.Ks.device)
@@ -256,7 +258,7 @@ class Cameras:
         Raises:
             InvalidArgumentError: The factor is no whole number above 0.
         """
-        check_whole(factor, "factor")
+        factor = checked_whole(factor, "factor")
         if factor == 1:
             return self
         strides = tuple(
@@ -312,7 +314,7 @@ class Cameras:
         Raises:
             InvalidArgumentError: The count is no whole number above 0.
         """
-        check_whole(count, "count")
+        count = checked_whole(count, "count")
         return self.select(spread_rows(len(self), count))
 
 

@@ -64,15 +64,14 @@ def target_count(
         >>> target_count(250, 0.01), target_count(10, 1e-9)
         (3, 1)
     """
-    check_whole(total, "total", least=0)
+    total = checked_whole(total, "total", least=0)
     values = {"rho": rho, "count": count, "max_count": max_count}
     given = [name for name, value in values.items() if value is not None]
     if len(given) != 1:
         found = " and ".join(given) or "none"
         raise InvalidArgumentError(f"give one of rho, count and max_count, found {found}.")
     if max_count is not None:
-        check_whole(max_count, "max_count")
-        return min(whole_number(max_count), total)
+        return min(checked_whole(max_count, "max_count"), total)
     if count is not None:
         number = whole_number(count)
         if not 1 <= number <= total:
@@ -123,9 +122,14 @@ def check_share(value: object, name: str) -> None:
         raise InvalidArgumentError(f"{name} must be a number from 0 to 1, found {shown(value)}.")
 
 
+def is_truth_value(value: object) -> bool:
+    """Check whether a value is True or False, also one of numpy or torch."""
+    return "bool" in type(value).__name__ or "bool" in str(getattr(value, "dtype", ""))
+
+
 def real_number(value: object) -> float:
     """Return a number as a float; NaN for anything else, such as texts and truth values."""
-    if isinstance(value, str | bytes | bytearray) or "bool" in type(value).__name__:
+    if isinstance(value, str | bytes | bytearray) or is_truth_value(value):
         return math.nan
     try:
         return float(value)  # type: ignore[arg-type]
@@ -135,7 +139,7 @@ def real_number(value: object) -> float:
 
 def whole_number(number: object) -> int:
     """Return a whole number of any type, or -1 if it is none."""
-    if isinstance(number, bool) or not hasattr(number, "__index__"):
+    if is_truth_value(number) or not hasattr(number, "__index__"):
         return -1
     try:
         return operator.index(number)
@@ -143,16 +147,20 @@ def whole_number(number: object) -> int:
         return -1
 
 
-def check_whole(
+def checked_whole(
     value: object, name: str, *, least: int = 1, most: int | None = None, things: str = ""
-) -> None:
-    """Raise unless a value is a whole number above 0, or at least 0, and at most one of things."""
+) -> int:
+    """Return a whole number of any type; raise unless it is at least 1 or 0, and at most a limit.
+
+    ``things`` says what the limit counts.
+    """
     number = whole_number(value)
     if number < least or (most is not None and number > most):
         limits = "above 0" if least else "at least 0"
         if most is not None:
             limits = f"between {least} and the {most:,} {things}"
         raise InvalidArgumentError(f"{name} must be a whole number {limits}, found {shown(value)}.")
+    return number
 
 
 def shortfall(valid: int, total: int, target: int) -> str:

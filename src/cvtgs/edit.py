@@ -11,14 +11,14 @@ from cvtgs.boxes import Box, Corner, inside, listed
 from cvtgs.checks import checked
 from cvtgs.counts import real_number
 from cvtgs.devices import without_autocast
-from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError, warn
 from cvtgs.math.parameters import multiply_quats, rotation_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS, rotated_rest
-from cvtgs.scene import NORMALS, GaussianScene, checked_scenes, concatenate
+from cvtgs.scene import NORMALS, GaussianScene, checked_scenes
 from cvtgs.tags import TWO_SCALES
 from cvtgs.text import shown
 
-__all__ = ["Motion", "Sphere", "crop", "drop_faint", "drop_large", "merge", "move"]
+__all__ = ["Motion", "Sphere", "concatenate", "crop", "drop_faint", "drop_large", "merge", "move"]
 
 _NO_TURN = (1.0, 0.0, 0.0, 0.0)
 _NO_SHIFT = (0.0, 0.0, 0.0)
@@ -330,11 +330,6 @@ def merge(scenes: Iterable[GaussianScene]) -> GaussianScene:
             f"{', '.join(map(repr, missing))}, which not all of the scenes to merge have.",
             DroppedDataWarning,
         )
-    if len({scene.antialiased for scene in scenes}) > 1:
-        warn(
-            "some of the scenes to merge were trained with anti-aliasing and others were not; "
-            "viewers will show the latter too soft.",
-        )
     dtype = torch.float64 if any(s.dtype == torch.float64 for s in scenes) else torch.float32
     degree = max(scene.sh_degree for scene in scenes)
     same_layout = len({scene.layout for scene in scenes}) == 1
@@ -346,6 +341,46 @@ def merge(scenes: Iterable[GaussianScene]) -> GaussianScene:
         comments = (*comments, TWO_SCALES.text)
     merged = concatenate(alike)
     return replace(merged, comments=comments, layout=scenes[0].layout if same_layout else ())
+
+
+def concatenate(scenes: Iterable[GaussianScene]) -> GaussianScene:
+    """Return the Gaussians of several scenes as one scene.
+
+    Args:
+        scenes: At least one, of the same SH degree, dtype, device and extra columns; comments and
+            layout are those of the first. A warning says if only some are tagged mip.
+
+    Returns:
+        All Gaussians, in the order of the scenes.
+
+    Raises:
+        InvalidSceneError: The scenes do not fit together.
+    """
+    scenes = checked_scenes(scenes, "joining")
+    first, *others = scenes
+    if not others:
+        return first
+    for number, other in enumerate(others, start=1):
+        if _kind(other) != _kind(first):
+            raise InvalidSceneError(
+                f"scenes to join must be alike; the first has {_kind(first)}, scene {number} "
+                f"{_kind(other)}."
+            )
+    if any(other.antialiased != first.antialiased for other in others):
+        warn(
+            "some of the scenes to join are tagged SplatRenderMode: mip and others are not; "
+            "viewers will show one of the two kinds too soft or too sharp."
+        )
+    tensors = [scene.tensors() for scene in scenes]
+    return first.with_tensors(
+        {name: torch.cat([each[name] for each in tensors]) for name in tensors[0]},
+        {name: torch.cat([scene.extras[name] for scene in scenes]) for name in first.extras},
+    )
+
+
+def _kind(scene: GaussianScene) -> str:
+    extras = sorted(scene.extras) or "none"
+    return f"SH degree {scene.sh_degree}, {scene.dtype} and extra columns {extras}"
 
 
 def _widened(

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any, Self
 
 __all__ = [
     "CheckpointError",
@@ -64,19 +65,43 @@ class FileFormatError(CvtgsError, ValueError):
     """A file violates its format; the message names path, property and row."""
 
 
-class InputNotFoundError(CvtgsError, FileNotFoundError):
+class _FileError(CvtgsError, OSError):
+    """Base of errors about a file; ``filename`` and ``errno`` are set if they are known."""
+
+    def __str__(self) -> str:  # OSError would return number, reason and name instead
+        return Exception.__str__(self)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _file_error, (type(self), self.args, self.errno, self.filename)
+
+    def about(self, path: str | os.PathLike[str], number: int | None) -> Self:
+        """Return the error with the name of its file and the number of the system's error."""
+        self.filename, self.errno = os.fspath(path), number
+        return self
+
+
+def _file_error(
+    kind: type[_FileError], args: tuple[Any, ...], number: int | None, path: str | None
+) -> _FileError:
+    """Return an error as it was pickled."""
+    error = kind(*args)
+    error.errno, error.filename = number, path
+    return error
+
+
+class InputNotFoundError(_FileError, FileNotFoundError):
     """The file to read does not exist."""
 
 
-class InputError(CvtgsError, OSError):
+class InputError(_FileError):
     """The file to read exists but cannot be read (a directory, no permission, a failing disk)."""
 
 
-class OutputExistsError(CvtgsError, FileExistsError):
+class OutputExistsError(_FileError, FileExistsError):
     """The file to write already exists and overwriting was not requested."""
 
 
-class OutputError(CvtgsError, OSError):
+class OutputError(_FileError):
     """The output could not be written (missing directory, no permission, disk full)."""
 
 
@@ -170,6 +195,8 @@ def check_path(path: object) -> None:
     """Raise unless a value can be the path of a file or folder."""
     if not isinstance(path, str | os.PathLike):
         raise InvalidArgumentError(f"a path must be a str or Path, found {type(path).__name__}.")
+    if not os.fspath(path):
+        raise InvalidArgumentError("a path must not be empty, found ''.")
 
 
 @contextmanager
@@ -181,7 +208,9 @@ def input_errors(path: str | os.PathLike[str]) -> Iterator[None]:
         raise
     except FileNotFoundError as error:
         found = "a web address; download it first" if _ADDRESS.match(str(path)) else "none"
-        raise InputNotFoundError(f"{path}: the file to read must exist, found {found}.") from error
+        text = f"{path}: the file to read must exist, found {found}."
+        raise InputNotFoundError(text).about(path, errno.ENOENT) from error
     except OSError as error:
         reason = reason_of(error)
-        raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
+        text = f"{path}: the file must be readable, found: {reason}."
+        raise InputError(text).about(path, error.errno) from error

@@ -10,7 +10,7 @@ from cvtgs.analysis import SceneAnalysis, perspective_falloff
 from cvtgs.analysis.effects import drawn_rows
 from cvtgs.checks import check_range, checked
 from cvtgs.config import FilterConfig
-from cvtgs.counts import check_share, check_whole
+from cvtgs.counts import check_share, checked_whole
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import divide
 from cvtgs.math.segments import running_sums, true_rows
@@ -62,7 +62,7 @@ def filter_rows(
             f"analysis must be that of the {len(scene):,} Gaussians of the scene, "
             f"found one of {len(opacities):,}."
         )
-    check_whole(target, "target", most=len(scene), things="Gaussians of the scene")
+    target = checked_whole(target, "target", most=len(scene), things="Gaussians of the scene")
     keep, is_hazy = opacities >= config.min_opacity, analysis.plan.haze.active
     if is_hazy or int(keep.sum()) < target:
         keep = visible_rows(
@@ -122,7 +122,7 @@ def visible_rows(
     """
     check_share(min_opacity, "min_opacity")
     check_share(max_mass_share, "max_mass_share")
-    check_whole(at_least, "at_least", least=0, most=len(opacities), things="Gaussians")
+    at_least = checked_whole(at_least, "at_least", least=0, most=len(opacities), things="Gaussians")
     check_range(opacities, 1, "opacities")
     faint = (opacities < min_opacity).nonzero()[:, 0]
     faint = faint[torch.sort(masses[faint], stable=True).indices]  # breaks ties of opacity

@@ -10,14 +10,14 @@ import torch
 from cvtgs.boxes import Corner
 from cvtgs.config.base import Record
 from cvtgs.counts import target_count, written, written_ratios
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import InvalidArgumentError, check_path
 from cvtgs.evaluation import Evaluation, SceneScores
 from cvtgs.evaluation.scorer import mean_of
 from cvtgs.io import check_output, check_save, load, save
 from cvtgs.io.atomic import make_folder, write_atomically
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.report import Level
-from cvtgs.text import counted, printable
+from cvtgs.text import counted, printable, shown
 
 __all__ = ["LevelEntry", "LevelsIndex", "write_levels"]
 
@@ -123,7 +123,7 @@ def write_levels(
     folder: str | os.PathLike[str],
     *,
     rhos: Sequence[float],
-    source: str,
+    source: str | os.PathLike[str],
     suffix: str = ".ply",
     axes: str | None = None,
     overwrite: bool = False,
@@ -134,7 +134,7 @@ def write_levels(
         levels: The levels.
         folder: Folder to write to; created if it is missing.
         rhos: Ratio of each level.
-        source: Name of the full scene.
+        source: Name or path of the full scene, for the index.
         suffix: File suffix, which selects the format.
         axes: The axes of the files, as :func:`cvtgs.io.change_axes` names them; None for those
             of the format.
@@ -144,8 +144,8 @@ def write_levels(
         The index, the finest level first.
 
     Raises:
-        InvalidArgumentError: There is no level, or the ratios are not those of the levels, all
-            different and in (0, 1].
+        InvalidArgumentError: There is no level, levels are of different scenes, or the ratios are
+            not those of the levels, all different and in (0, 1].
         OutputExistsError: A file exists and may not be replaced.
         OutputError: A file cannot be written.
 
@@ -158,8 +158,16 @@ def write_levels(
         >>> [(level.file, level.count) for level in index.levels]
         [('rho_0.1.ply', 50), ('rho_0.02.ply', 10)]
     """
-    if not levels:
-        raise InvalidArgumentError("levels to write must be at least one, found none.")
+    if not levels or not all(isinstance(level, Level) for level in levels):
+        raise InvalidArgumentError(
+            f"levels must be those that Simplifier.levels returns, found {shown(levels)}."
+        )
+    sizes = sorted({level.report.input_count for level in levels})
+    if len(sizes) > 1:
+        raise InvalidArgumentError(
+            f"levels must be of one scene, found scenes of {sizes[0]:,} and {sizes[1]:,} Gaussians."
+        )
+    check_path(source)
     ratios = written_ratios(rhos)
     if len(ratios) != len(levels):
         raise InvalidArgumentError(
@@ -184,7 +192,7 @@ def write_levels(
         save(level.scene, place / name, overwrite=overwrite, axes=axes)
         entries.append(_entry(level, rho, place / name))
     index = LevelsIndex(
-        source=printable(source),
+        source=printable(os.fspath(source)),
         source_count=levels[0].report.input_count,
         levels=tuple(sorted(entries, key=lambda entry: -entry.count)),
     )

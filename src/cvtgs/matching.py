@@ -12,7 +12,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Partition
 from cvtgs.config import MatchConfig
-from cvtgs.counts import check_whole
+from cvtgs.counts import checked_whole
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import parameters
 from cvtgs.math.segments import segment_sum
@@ -112,7 +112,7 @@ def fit_colors(
         True
     """
     check_observed(views, "views")
-    check_whole(frozen, "frozen", least=0, most=len(small), things="Gaussians")
+    frozen = checked_whole(frozen, "frozen", least=0, most=len(small), things="Gaussians")
     if not config.color_iterations:
         return small
     linear = [
@@ -339,7 +339,7 @@ def match_opacities(
         >>> bool(contributions(found, views).sum() < 1.2 * wanted.sum())
         True
     """
-    check_whole(frozen, "frozen", least=0, most=len(small), things="Gaussians")
+    frozen = checked_whole(frozen, "frozen", least=0, most=len(small), things="Gaussians")
     check_amounts(targets, "targets", len(small), ignored=frozen)
     for _ in range(config.opacity_rounds):
         own = contributions(small, cameras)

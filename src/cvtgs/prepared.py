@@ -23,13 +23,14 @@ from cvtgs.devices import (
     without_autocast,
     without_spinning,
 )
+from cvtgs.edit import concatenate
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.grouping import OrderedRows, add_neighbors, importance_by_errors, order_rows
 from cvtgs.mergenet import Checkpoint, Net
 from cvtgs.pipeline import Reduced, level_facts, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified, SimplifyReport, origin_of_views
-from cvtgs.scene import GaussianScene, concatenate
+from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
 from cvtgs.validity import CheckedScene, check_rows, with_finite_opacities
 

@@ -13,6 +13,7 @@ from multiprocessing import get_context
 from types import TracebackType
 from typing import Protocol, Self, TypeVar, runtime_checkable
 
+from cvtgs.counts import checked_whole
 from cvtgs.errors import InvalidArgumentError, RunError
 from cvtgs.startup import load_torch
 
@@ -74,10 +75,7 @@ class LocalWorkers:
     """
 
     def __init__(self, count: int, remedy: str = "with less --memory or fewer --workers") -> None:
-        if count < 1:
-            raise InvalidArgumentError(
-                f"the number of processes must be at least 1, found {count}."
-            )
+        count = checked_whole(count, "the number of processes")
         self._count, self._remedy = pool_size(count), remedy
 
     def __enter__(self) -> Self:
@@ -118,8 +116,11 @@ class LocalWorkers:
             The results, in the order of the items.
 
         Raises:
+            InvalidArgumentError: The workers were not started by ``with``.
             RunError: A process ended unexpectedly.
         """
+        if not hasattr(self, "_pool"):
+            raise InvalidArgumentError("workers run inside `with LocalWorkers(...) as workers:`.")
         futures = deque[Future[bytes]]()
         try:
             for one in items:  # the pool refuses work if a process ended since the last call

@@ -21,7 +21,7 @@ class ProgressEvent:
     note: str = ""
 
 
-ProgressListener = Callable[[ProgressEvent], None]
+ProgressListener = Callable[[ProgressEvent], object]
 """A callable that takes a :class:`ProgressEvent`. An exception that it raises ends the call."""
 
 

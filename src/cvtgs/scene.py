@@ -105,9 +105,15 @@ class GaussianScene:
                 f"shN must hold 0, 3, 8 or 15 coefficients per channel, found {bands}."
             )
         names = tuple(self.extras) if isinstance(self.extras, Mapping) else self.extras
-        for what, lines in (("comments", self.comments), ("names of extra columns", names)):
-            if not isinstance(lines, tuple | list) or not all(isinstance(x, str) for x in lines):
-                raise InvalidSceneError(f"{what} must be a tuple of texts, found {shown(lines)}.")
+        of_texts, of_pairs = ("texts", str), ("pairs", tuple | list)
+        for what, lines, (entries, kind) in (
+            ("comments", self.comments, of_texts),
+            ("names of extra columns", names, of_texts),
+            ("layout", self.layout, of_pairs),
+        ):
+            if not isinstance(lines, tuple | list) or not all(isinstance(x, kind) for x in lines):
+                wanted = f"{what} must be a tuple of {entries}"
+                raise InvalidSceneError(f"{wanted}, found {shown(lines)}.")
         for name, column in self.extras.items():
             found = getattr(column, "dtype", type(column).__name__)
             if not isinstance(column, Tensor) or found in _NOT_INDEXABLE:
@@ -280,6 +286,8 @@ class GaussianScene:
         Raises:
             InvalidSceneError: A tensor name is unknown, or tensors do not fit together.
         """
+        if not isinstance(tensors, Mapping | None):
+            raise InvalidSceneError(f"tensors must be a mapping by name, found {shown(tensors)}.")
         given = {**(tensors or {}), **named}
         unknown = sorted(given.keys() - set(_TENSORS))
         if unknown:
@@ -362,39 +370,3 @@ def checked_scenes(scenes: Any, work: str) -> list[GaussianScene]:
     if len(places) > 1:
         raise InvalidSceneError(f"{work} needs scenes on one device, found {', '.join(places)}.")
     return found
-
-
-def concatenate(scenes: Iterable[GaussianScene]) -> GaussianScene:
-    """Return the Gaussians of several scenes as one scene.
-
-    Args:
-        scenes: At least one, of the same SH degree, dtype, device and extra columns; comments and
-            layout are those of the first.
-
-    Returns:
-        All Gaussians, in the order of the scenes.
-
-    Raises:
-        InvalidSceneError: The scenes do not fit together.
-    """
-    scenes = checked_scenes(scenes, "joining")
-    first, *others = scenes
-    if not others:
-        return first
-    for number, other in enumerate(others, start=1):
-        if set(other.extras) != set(first.extras):
-            raise InvalidSceneError(
-                f"scenes to join must have the same extra columns; the first has "
-                f"{sorted(first.extras)}, scene {number} has {sorted(other.extras)}."
-            )
-        if (other.sh_degree, other.dtype) != (first.sh_degree, first.dtype):
-            raise InvalidSceneError(
-                f"scenes to join must have the same SH degree and dtype; the first has "
-                f"{first.sh_degree} and {first.dtype}, scene {number} {other.sh_degree} and "
-                f"{other.dtype}."
-            )
-    tensors = [scene.tensors() for scene in scenes]
-    return first.with_tensors(
-        {name: torch.cat([each[name] for each in tensors]) for name in tensors[0]},
-        {name: torch.cat([scene.extras[name] for scene in scenes]) for name in first.extras},
-    )

@@ -148,7 +148,7 @@ def test_merging_says_what_is_lost_and_mixed(
     converted(tmp_path, *both)
     printed = capsys.readouterr()
     assert "columns that not all scenes have (label)" in printed.out
-    assert "trained with anti-aliasing" in printed.err
+    assert "are tagged SplatRenderMode: mip and others are not" in printed.err
     assert "label" not in printed.err
     converted(tmp_path, *both, "--quiet")
     printed = capsys.readouterr()

@@ -184,6 +184,11 @@ def test_a_background_that_is_no_color_is_refused(color):
         EvaluationSettings(background=color)
 
 
+def test_a_background_may_be_a_tensor():
+    settings = EvaluationSettings(background=torch.ones(3))
+    assert settings == EvaluationSettings(background=(1.0, 1.0, 1.0))
+
+
 def test_the_background_shows_through(scene, small, cameras):
     settings = EvaluationSettings(lpips="off", background=(1.0, 1.0, 1.0))
     white = compare(scene, small, cameras, settings=settings)

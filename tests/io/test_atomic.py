@@ -2,6 +2,7 @@
 
 import errno
 import os
+import pickle
 import stat
 import subprocess
 import sys
@@ -10,8 +11,8 @@ from typing import NoReturn
 
 import pytest
 
-from cvtgs.errors import FileFormatError, OutputError, OutputExistsError
-from cvtgs.io import atomic, atomic_output, check_output, check_save
+from cvtgs.errors import FileFormatError, InputNotFoundError, OutputError, OutputExistsError
+from cvtgs.io import atomic, atomic_output, check_output, check_save, load
 
 
 def write(path: Path, data: bytes = b"new", *, overwrite: bool = False) -> None:
@@ -292,3 +293,52 @@ def test_devices_and_pipes_are_never_replaced(tmp_path: Path, overwrite: bool) -
         assert str(caught.value) == (
             f"{path}: the output must be a regular file, found a device or a pipe."
         )
+
+
+@pytest.mark.parametrize("name", ["_publish", "_is_own"])
+def test_an_interrupt_at_the_end_leaves_no_temporary_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    def interrupt(*_: object, **__: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(atomic, name, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path / "a.bin")
+    assert [path.name for path in tmp_path.iterdir()] in ([], ["a.bin"])
+
+
+def test_an_interrupt_while_it_is_created_leaves_no_temporary_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def create(path: Path, mode: str) -> NoReturn:
+        path.write_bytes(b"")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "open", create)
+    monkeypatch.setattr(Path, "write_bytes", lambda path, data: os.close(os.open(path, os.O_CREAT)))
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path / "a.bin")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_errors_have_the_number_and_name_of_the_systems_error(tmp_path: Path) -> None:
+    """They also survive the way out of another process."""
+    (tmp_path / "a.bin").write_bytes(b"old")
+    for path, number, kind in (
+        (tmp_path / "a.bin", errno.EEXIST, OutputExistsError),
+        (tmp_path / "none" / "a.bin", errno.ENOENT, OutputError),
+        (tmp_path, errno.EISDIR, OutputError),
+    ):
+        with pytest.raises(kind) as caught:
+            write(path)
+        error = caught.value
+        for one in (error, pickle.loads(pickle.dumps(error))):
+            assert (type(one), one.errno, one.filename) == (kind, number, str(path))
+            assert str(one) == str(error)
+            assert str(one).startswith(f"{path}: the output must ")
+    with pytest.raises(InputNotFoundError, match=r"c\.ply: the file to read must exist") as missing:
+        load(tmp_path / "c.ply")
+    assert (missing.value.errno, missing.value.filename) == (errno.ENOENT, str(tmp_path / "c.ply"))
+    full = OSError(errno.ENOSPC, "No space left on device")
+    assert atomic.write_error("b.bin", full).errno == errno.ENOSPC

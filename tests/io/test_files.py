@@ -246,7 +246,6 @@ def test_other_values_than_paths_are_refused(call: Callable[[Any], object]) -> N
         lambda scene: losses(scene, "a.sog"),
         lambda scene: save(scene, "a.ply"),
         lambda scene: change_axes(scene, "rdf", "rub"),
-        lambda scene: find_own_cameras(scene, "a.ply"),
         lambda scene: contributions(scene, one_camera(4, 4)),
         lambda scene: observe(scene, one_camera(4, 4)),
         lambda scene: blending_weights(scene, one_camera(4, 4)),

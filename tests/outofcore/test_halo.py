@@ -11,6 +11,7 @@ from block_jobs import unfinished_job
 from cvtgs import SimplifyConfig, cells, cvt, validity
 from cvtgs.cells import Moments
 from cvtgs.cvt.nearest import nearest_several
+from cvtgs.edit import concatenate
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.grouping import REASSIGN, allocation_at
 from cvtgs.math.segments import take_columns
@@ -20,7 +21,6 @@ from cvtgs.outofcore.halo import Balls, OtherBlock, assign_points, bounding_box,
 from cvtgs.outofcore.merge import read_cells
 from cvtgs.outofcore.rows import read_rows
 from cvtgs.pipeline import shape_merged
-from cvtgs.scene import concatenate
 from cvtgs.tags import ANTIALIASED
 from cvtgs.views import automatic_views
 from scenes import same_bits

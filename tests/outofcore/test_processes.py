@@ -16,7 +16,7 @@ import pytest
 import cvtgs
 from cvtgs.cli.main import main
 from cvtgs.devices import core_count
-from cvtgs.errors import InvalidSceneError, RunError
+from cvtgs.errors import InvalidArgumentError, InvalidSceneError, RunError
 from cvtgs.outofcore import LocalWorkers, simplify_file
 from cvtgs.outofcore.memory import ROOMY_BYTES, worker_count
 from process_cases import die, numbered, refuse, wait
@@ -181,3 +181,14 @@ def test_zero_workers_are_refused(source, tmp_path, capsys):
     words = ["simplify", str(source), str(tmp_path / "a.ply"), "--rho", "0.1", "--workers", "0"]
     assert main(words) == 1
     assert capsys.readouterr().err == "cvtgs: error: --workers must be at least 1, found 0.\n"
+
+
+@pytest.mark.parametrize("count", [0, None, "2", 1.5, True])
+def test_a_wrong_number_of_processes_is_refused(count):
+    with pytest.raises(InvalidArgumentError, match="number of processes must be a whole number"):
+        LocalWorkers(count)
+
+
+def test_processes_must_be_started():
+    with pytest.raises(InvalidArgumentError, match="workers run inside `with LocalWorkers"):
+        next(LocalWorkers(1)(abs, [-1]))

@@ -11,13 +11,13 @@ from block_jobs import unfinished_job
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.analysis.analyze import visibility_cameras
 from cvtgs.boxes import Box, inside
+from cvtgs.edit import concatenate
 from cvtgs.io.tensors import map_tensors
 from cvtgs.outofcore import simplify_file
 from cvtgs.outofcore.images import read_apparent_rows, write_views
 from cvtgs.outofcore.rows import read_rows
 from cvtgs.progress import silent
 from cvtgs.rendering import contributions
-from cvtgs.scene import concatenate
 from refine_cases import ring
 from scenes import same_bits
 

@@ -10,6 +10,7 @@ import torch
 
 import cvtgs
 from cvtgs.config import Rates
+from cvtgs.edit import concatenate
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import LOGIT_LIMIT
 from cvtgs.math.spherical_harmonics import SH_C0
@@ -17,7 +18,6 @@ from cvtgs.refinement import refine
 from cvtgs.refinement.images import ImageBuffer
 from cvtgs.refinement.optimize import SceneOptimizer
 from cvtgs.rendering import choose_backend
-from cvtgs.scene import concatenate
 from refine_cases import as_dtype, discolored, full_scene, quick, ring, small_scene
 from scenes import random_scene, same_bits
 

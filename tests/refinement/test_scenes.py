@@ -108,9 +108,27 @@ def test_the_same_steps_give_the_same_bits_and_another_seed_others():
 def test_without_time_for_a_step_the_scene_is_returned_unchanged():
     full = full_scene()
     small = small_scene(full)
-    refined = refine(small, full, seconds=1e-3, config=quick())
+    with pytest.warns(UserWarning, match=r"no step of the refinement fits into 0\.001 s, so the"):
+        refined = refine(small, full, seconds=1e-3, config=quick())
     assert refined.scene is small
     assert (refined.report.steps, refined.report.stopped) == (0, "time")
+
+
+def test_an_empty_scene_is_refused():
+    full = full_scene()
+    with pytest.raises(InvalidSceneError, match="none of the 0 of the simplified scene is valid"):
+        refine(full[:0], full, steps=1, config=quick())
+
+
+def test_results_are_not_part_of_a_graph():
+    full = full_scene()
+    small = small_scene(full)
+    wanting = small.with_tensors(
+        {name: tensor.clone().requires_grad_() for name, tensor in small.tensors().items()}
+    )
+    found = refine(wanting, full, steps=2, cameras=ring(4), config=quick(check_every=1)).scene
+    assert found is not wanting
+    assert not any(tensor.requires_grad for tensor in found.tensors().values())
 
 
 @pytest.mark.slow

@@ -243,6 +243,15 @@ def test_a_new_stream_removes_the_files_of_the_old_one(
     assert names[0] == names[1] | {"own.html", "9_9_9"}
 
 
+def test_levels_of_several_scenes_are_refused(levels: tuple[Level, ...]) -> None:
+    other = Simplifier(device="cpu").levels(levels[1].scene, [0.05])
+    with pytest.raises(InvalidArgumentError, match="must be of one scene, found scenes of"):
+        plan_stream([*levels, *other])
+    scenes: list[Any] = [level.scene for level in levels]
+    with pytest.raises(InvalidArgumentError, match=r"that Simplifier\.levels returns, found Gauss"):
+        plan_stream(scenes)
+
+
 def test_wrong_levels_and_chunk_sizes_are_refused(levels: tuple[Level, ...]) -> None:
     for wrong in ([], [levels[0], levels[0]]):
         with pytest.raises(InvalidArgumentError, match="needs levels of different sizes"):

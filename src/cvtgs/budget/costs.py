@@ -11,7 +11,7 @@ import pydantic
 from cvtgs.cells.partition import MOST_SAMPLED
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record, explain, named
-from cvtgs.counts import check_whole, whole_number
+from cvtgs.counts import checked_whole, whole_number
 from cvtgs.cvt.tessellate import MIN_SAMPLES
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.grouping import finer_count
@@ -64,7 +64,7 @@ class Work:
     colors: int = 3
 
     def __post_init__(self) -> None:
-        check_whole(self.count, "count")
+        checked_whole(self.count, "count")
         if not 1 <= whole_number(self.target) <= self.count:
             raise InvalidArgumentError(
                 f"target must be a whole number from 1 to the count, {self.count:,}; "

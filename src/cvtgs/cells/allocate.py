@@ -15,7 +15,7 @@ from cvtgs.analysis.effects import far_share
 from cvtgs.cells.moments import UPPER, Moments
 from cvtgs.checks import checked
 from cvtgs.config import AllocationConfig
-from cvtgs.counts import check_whole
+from cvtgs.counts import checked_whole
 from cvtgs.devices import in_chunks
 from cvtgs.math.segments import label_argmin, take_columns
 
@@ -70,7 +70,7 @@ def merge_pairs(
     Raises:
         InvalidArgumentError: ``count`` is outside 1 to m, or shapes or types do not fit.
     """
-    check_whole(count, "count", most=len(groups.masses), things="groups")
+    count = checked_whole(count, "count", most=len(groups.masses), things="groups")
     contrast = _relative_contrast(groups.colors, neighbors)
     far = float(far_share(torch.linalg.vector_norm(groups.means, dim=0), groups.apparent_masses))
     update = {

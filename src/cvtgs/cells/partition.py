@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, Integer
 from torch import Tensor
 
 from cvtgs.checks import check_kinds, check_range, checked
-from cvtgs.counts import check_whole
+from cvtgs.counts import checked_whole
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import parameters
 from cvtgs.math.segments import (
@@ -68,7 +68,7 @@ class Partition:
             >>> Partition.from_labels(torch.tensor([1, 0, 1]), 2).order.tolist()
             [1, 0, 2]
         """
-        check_whole(count, "count")
+        count = checked_whole(count, "count")
         order, offsets = sort_by_label(labels, count)
         ends, counts = labels.aminmax() if len(labels) else (), offsets.diff()
         sums = (counts == 0).sum(), (counts == 1).sum()

@@ -350,7 +350,7 @@ class RefineConfig(ImageSection):
 
     def _times(self, count: int) -> float:
         """Return the factor of the number of steps."""
-        side = self.size / (self.stride * math.sqrt(count))  # pixels for each Gaussian along a side
+        side = self.size / self.stride / math.sqrt(max(1, count))  # pixels per Gaussian
         return min(side, self.lengthening) if side >= LEAST_LENGTHENING else 1.0
 
     def new_images(self, steps: int, *, shared: int = 0) -> int:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 import pydantic
@@ -17,8 +18,15 @@ from cvtgs.config.sections import (
     TessellationConfig,
     VisibilityConfig,
 )
-from cvtgs.errors import ConfigError
+from cvtgs.errors import ConfigError, check_path
 from cvtgs.text import shown, suggestion
+
+
+def _frozen(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a mapping that cannot be changed, nor those in it."""
+    return MappingProxyType(
+        {key: _frozen(value) if isinstance(value, dict) else value for key, value in values.items()}
+    )
 
 
 def unknown_preset(name: object) -> ConfigError:
@@ -66,41 +74,43 @@ THINNED: Mapping[str, Any] = {
     "lengthening": 4.0,
 }
 
-PRESETS: Mapping[str, Mapping[str, Any]] = {
-    "draft": {"cvt": {"iterations": 0}, "merge": {"network": False}},
-    "fast": {"merge": {"network": False}},
-    "standard": {},
-    "matched": MATCHED,
-    "high": {
-        **MATCHED,
-        "visibility": {**MATCHED["visibility"], "views": 72},
-        "refine": THINNED,
-    },
-    "paper": {
-        "effects": {"unbounded": "off", "duplicates": "off"},
-        "filter": {"min_opacity": 0.1, "max_mass_share": 1.0, "max_flyaway_share": 0.0},
-        "cvt": {
-            "area_power": 0.0,
-            "perspective": False,
-            "hidden_share": 1.0,
-            "weight_floor": 0.0,
-            "color": 0.0,
-            "seeding": "weighted",
-            "iterations": 5,
-            "tolerance": 0.0,
-            "samples_per_site": 0,
+PRESETS: Mapping[str, Mapping[str, Any]] = _frozen(
+    {
+        "draft": {"cvt": {"iterations": 0}, "merge": {"network": False}},
+        "fast": {"merge": {"network": False}},
+        "standard": {},
+        "matched": MATCHED,
+        "high": {
+            **MATCHED,
+            "visibility": {**MATCHED["visibility"], "views": 72},
+            "refine": THINNED,
         },
-        "allocation": {"oversampling": 1.0, "reassign": False},
-        "merge": {
-            "area_power": 0.0,
-            "opacity": "union",
-            "representatives": False,
-            "align_axes": False,
-            "inflation": 0.0,
-            "covered_inflation": 0.0,
+        "paper": {
+            "effects": {"unbounded": "off", "duplicates": "off"},
+            "filter": {"min_opacity": 0.1, "max_mass_share": 1.0, "max_flyaway_share": 0.0},
+            "cvt": {
+                "area_power": 0.0,
+                "perspective": False,
+                "hidden_share": 1.0,
+                "weight_floor": 0.0,
+                "color": 0.0,
+                "seeding": "weighted",
+                "iterations": 5,
+                "tolerance": 0.0,
+                "samples_per_site": 0,
+            },
+            "allocation": {"oversampling": 1.0, "reassign": False},
+            "merge": {
+                "area_power": 0.0,
+                "opacity": "union",
+                "representatives": False,
+                "align_axes": False,
+                "inflation": 0.0,
+                "covered_inflation": 0.0,
+            },
         },
-    },
-}
+    }
+)
 """Changes of each preset to the defaults; ``standard`` has none.
 
 They are in the order of time, from the fastest to the best, on which ``--time-budget`` relies.
@@ -114,7 +124,8 @@ class SimplifyConfig(Section):
     """The configuration of a simplification; frozen, unknown keys are errors.
 
     Values that are not given are those of the preset, also within sections that are given as
-    mappings: ``SimplifyConfig(preset="paper", cvt={"iterations": 10})``.
+    mappings: ``SimplifyConfig(preset="paper", cvt={"iterations": 10})``. Type checkers accept these
+    in :meth:`from_mapping` only; a section that is given as an object has the defaults elsewhere.
 
     Attributes:
         preset: Name of the preset that the values start from.
@@ -201,8 +212,11 @@ class SimplifyConfig(Section):
             The configuration.
 
         Raises:
-            ConfigError: A key is unknown or a value is out of range; the message names it.
+            ConfigError: The values are no mapping, a key is unknown or a value is out of range; the
+                message names it.
         """
+        if not isinstance(values, Mapping):
+            raise ConfigError(f"a configuration must be a mapping, found {shown(values)}.")
         return cls(**{str(key): value for key, value in values.items()})
 
     @classmethod
@@ -217,7 +231,9 @@ class SimplifyConfig(Section):
 
         Raises:
             ConfigError: The file cannot be read, is not TOML, or holds a bad key or value.
+            InvalidArgumentError: The path is no path.
         """
+        check_path(path)
         return cls.compose(file=path)
 
     @classmethod
@@ -242,7 +258,13 @@ class SimplifyConfig(Section):
         Raises:
             ConfigError: The file cannot be read, a key is unknown, or a value is out of range.
         """
+        if file is not None:
+            check_path(file)
         values = {} if file is None else read_toml(Path(file))
+        if not isinstance(settings, Mapping | None) or not all(
+            isinstance(key, str) for key in settings or {}
+        ):
+            raise ConfigError(f"settings must be texts by dotted key, found {shown(settings)}.")
         if preset is not None:
             values["preset"] = preset
         try:
@@ -260,7 +282,7 @@ class SimplifyConfig(Section):
             raise ConfigError(str(error) if file is None else f"{file}: {error}") from None
 
     def to_toml(self) -> str:
-        """Return the configuration as TOML text that :meth:`from_toml` reads back.
+        """Return the configuration as TOML text; :meth:`from_toml` reads it from a file.
 
         Returns:
             TOML text with all keys.

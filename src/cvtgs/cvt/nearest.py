@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.checks import checked
-from cvtgs.counts import check_whole
+from cvtgs.counts import checked_whole
 from cvtgs.cvt.device_search import nearest_in_tiles
 from cvtgs.devices import HOST, thread_count
 from cvtgs.errors import InvalidArgumentError
@@ -183,7 +183,7 @@ def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m
         [[1], [0], [1]]
     """
     _check_sites(sites)
-    check_whole(count, "count", least=0)
+    count = checked_whole(count, "count", least=0)
     with_self = min(count + 1, len(sites))
     apart = _apart(sites.detach().to(search_device(sites.device)))
     rows, _ = _nearest_apart(apart, apart, with_self)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cvtgs.checks import check_range, checked
 from cvtgs.config import TessellationConfig
-from cvtgs.counts import check_whole
+from cvtgs.counts import checked_whole
 from cvtgs.cvt.nearest import NearestSite, nearest_site, search_device, search_once_per_position
 from cvtgs.devices import move_together
 from cvtgs.errors import InvalidArgumentError
@@ -75,7 +75,7 @@ def tessellate(
         >>> tessellate(points, torch.ones(3), 2, config=TessellationConfig()).labels.tolist()
         [0, 1, 1]
     """
-    check_whole(count, "count", most=len(points), things="points")
+    count = checked_whole(count, "count", most=len(points), things="points")
     points, weights, home = points.detach(), weights.detach(), points.device
     if count == len(points):  # nothing to group
         own = torch.arange(count, device=home)
@@ -125,7 +125,7 @@ def choose_seeds(
     Raises:
         InvalidArgumentError: ``count`` is outside 1 to n, or a weight is negative or not finite.
     """
-    check_whole(seed, "seed", least=0)
+    seed = checked_whole(seed, "seed", least=0)
     if config.seeding == "weighted":
         return weighted_seeds(weights, count, torch.Generator().manual_seed(seed))
     return stratified_seeds(weights, count)[0]
@@ -157,7 +157,7 @@ def stratified_seeds(
         ([1, 3], [3.0, 9.0])
     """
     weights = weights.detach().double()
-    check_whole(count, "count", most=len(weights), things="points")
+    count = checked_whole(count, "count", most=len(weights), things="points")
     if _checked_sum(weights) == 0.0:
         weights = torch.ones_like(weights)
     rows, left = torch.empty(0, dtype=torch.int64, device=weights.device), weights.clone()
@@ -211,7 +211,7 @@ def weighted_seeds(
         >>> weighted_seeds(torch.tensor([0.0, 1.0]), 1, torch.Generator().manual_seed(0)).tolist()
         [1]
     """
-    check_whole(count, "count", most=len(weights), things="points")
+    count = checked_whole(count, "count", most=len(weights), things="points")
     _checked_sum(weights.detach())
     uniform = torch.rand(len(weights), generator=generator, dtype=torch.float64, device="cpu")
     keys = -torch.log(uniform.clamp_min(1e-300)).to(weights.device) / weights.double()
@@ -294,7 +294,7 @@ def lloyd(
         ... ).sites.tolist()
         [[0.5], [8.0]]
     """
-    check_whole(iterations, "iterations", least=0)
+    iterations = checked_whole(iterations, "iterations", least=0)
     energies: list[float] = []
     points, weights, sites = points.detach(), weights.detach(), sites.detach().double()
     for done in range(iterations):
@@ -360,7 +360,7 @@ def fill_empty_cells(
         >>> labels.tolist(), refilled
         ([0, 1], 1)
     """
-    check_whole(count, "count", most=len(labels), things="points")
+    count = checked_whole(count, "count", most=len(labels), things="points")
     check_range(labels, count - 1, "labels")
     members = torch.bincount(labels, minlength=count)
     empty = (members == 0).nonzero()[:, 0]

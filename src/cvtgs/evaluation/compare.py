@@ -12,7 +12,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.checks import check_kinds
 from cvtgs.clock import check_listener
-from cvtgs.counts import check_whole, spread_rows
+from cvtgs.counts import checked_whole, spread_rows
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation.images import as_bytes
 from cvtgs.evaluation.scorer import (
@@ -179,7 +179,7 @@ def compare(  # noqa: PLR0913 (options by name)
         (2, 24, 32, 3)
     """
     if most_images is not None:
-        check_whole(most_images, "most_images")
+        most_images = checked_whole(most_images, "most_images")
     scenes = _named_scenes(reference, small, reference_name)
     for name in sizes or {}:
         if name not in scenes:

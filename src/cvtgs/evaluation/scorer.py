@@ -160,6 +160,7 @@ class EvaluationSettings:
             raise InvalidArgumentError(
                 f"background must be three numbers in [0, 1], found {shown(self.background)}."
             )
+        object.__setattr__(self, "background", tuple(map(float, self.background)))
         for name, choices in (("lpips", LpipsChoice), ("backend", BackendName)):
             if getattr(self, name) not in get_args(choices):
                 raise InvalidArgumentError(
@@ -344,7 +345,7 @@ class Scorer:
         metrics: Metrics,
         images: Iterable[ViewImages] = (),
         backgrounds: Sequence[Color] = (BLACK,),
-        progress: Callable[[int], None] = lambda done: None,
+        progress: Callable[[int], object] = lambda done: None,
     ) -> None:
         self._metrics = metrics
         self._backgrounds = [full.means.new_tensor(color) for color in backgrounds]

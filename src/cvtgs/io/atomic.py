@@ -69,20 +69,21 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
         if target.is_symlink():  # realpath follows all links but loops
             raise _refusal(path, "be a file", "a loop of symbolic links")
         if target.is_dir() or os.fspath(path).endswith(("/", os.sep)):
-            raise _refusal(path, "be a file", "a directory")
+            raise _refusal(path, "be a file", "a directory", errno.EISDIR)
         # a path such as /dev/stdout leads to a pipe or a terminal, but its target does not exist
         if any(one.exists() and not one.is_file() for one in (target, Path(path))):
             raise _refusal(path, "be a regular file", "a device or a pipe")
         if target.exists() and not overwrite:
             raise _exists(path)
         if _WINDOWS and target.exists() and not os.access(target, os.W_OK):
-            raise _refusal(path, "be writable", "a read-only file")
+            raise _refusal(path, "be writable", "a read-only file", errno.EACCES)
         for folder in (target.parent, Path(path).parent):  # "missing/.." is not resolved by name
             if not folder.is_dir():
-                raise _refusal(path, "be in an existing directory", f"no directory {folder}")
+                found = f"no directory {folder}"
+                raise _refusal(path, "be in an existing directory", found, errno.ENOENT)
         if not os.access(target.parent, os.W_OK | os.X_OK):
             missing = f"no permission to write in {target.parent}"
-            raise _refusal(path, "be in a writable directory", missing)
+            raise _refusal(path, "be in a writable directory", missing, errno.EACCES)
     except OSError as error:
         if isinstance(error, CvtgsError):
             raise
@@ -140,6 +141,10 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
         if isinstance(error, FileExistsError):
             raise _exists(path) from error
         raise write_error(path, error) from error
+    except BaseException:
+        if temporary is not None:  # an interrupt may have ended the removal above
+            _remove_leftover(temporary)
+        raise
     finally:
         if fcntl is None and temporary is not None:
             with suppress(OSError):  # another program holds it; a later run removes it
@@ -186,6 +191,9 @@ def _open_temporary(target: Path) -> tuple[Path, BinaryIO]:
             file = temporary.open("xb")
         except FileExistsError:  # another process writes to it
             continue
+        except BaseException:  # an interrupt, perhaps after it was created
+            _remove_leftover(temporary)
+            raise
         if _lock(file.fileno()) and os.fstat(file.fileno()).st_nlink:
             return temporary, file
         file.close()
@@ -314,17 +322,21 @@ def _concerns(error: OSError, target: Path) -> bool:
 
 
 def _exists(path: str | os.PathLike[str]) -> OutputExistsError:
-    return OutputExistsError(
+    text = (
         f"{os.fspath(path)}: the output must not exist yet, found a file; pass overwrite=True "
         f"(--overwrite) to replace it."
     )
+    return OutputExistsError(text).about(path, errno.EEXIST)
 
 
-def _refusal(path: str | os.PathLike[str], required: str, found: str) -> OutputError:
-    return OutputError(f"{os.fspath(path)}: the output must {required}, found {found}.")
+def _refusal(
+    path: str | os.PathLike[str], required: str, found: str, number: int | None = None
+) -> OutputError:
+    text = f"{os.fspath(path)}: the output must {required}, found {found}."
+    return OutputError(text).about(path, number)
 
 
 def write_error(path: str | os.PathLike[str], error: OSError) -> OutputError:
     """Return the error for an output that the system refused to write."""
-    reason = reason_of(error)
-    return OutputError(f"{os.fspath(path)}: the output must be writable, found: {reason}.")
+    text = f"{os.fspath(path)}: the output must be writable, found: {reason_of(error)}."
+    return OutputError(text).about(path, error.errno)

@@ -1,5 +1,6 @@
 """Named tensors in safetensors files, which store networks and caches (never pickles)."""
 
+import errno
 import json
 import os
 from collections.abc import Mapping
@@ -54,7 +55,8 @@ def map_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[s
     from safetensors import SafetensorError, safe_open  # noqa: PLC0415
 
     if not Path(path).is_file():
-        raise InputNotFoundError(f"{path}: the file to read must exist, found none.")
+        text = f"{path}: the file to read must exist, found none."
+        raise InputNotFoundError(text).about(path, errno.ENOENT)
     try:
         with safe_open(os.fspath(path), framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

@@ -28,6 +28,7 @@ from cvtgs.boxes import inside
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
 from cvtgs.devices import one_thread
+from cvtgs.edit import concatenate
 from cvtgs.grouping import importance_by_errors
 from cvtgs.io import load
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
@@ -38,7 +39,7 @@ from cvtgs.outofcore.rows import BlockRows, kept_rows, read_rows
 from cvtgs.refinement import refine
 from cvtgs.rendering import ObservedViews, contributions, error_shares, observe
 from cvtgs.report import MatchReport, RefineReport
-from cvtgs.scene import GaussianScene, concatenate
+from cvtgs.scene import GaussianScene
 from cvtgs.views import find_view_positions, mixed_views
 
 MEASURED = "measured.json"  # file of the sums over all blocks

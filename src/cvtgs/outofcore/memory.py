@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from cvtgs.counts import check_whole, whole_number
+from cvtgs.counts import checked_whole, whole_number
 from cvtgs.devices import core_count
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.ply import PlyRows
@@ -181,8 +181,7 @@ def chosen_blocks(
     """Return the number of blocks that is wanted, else the one that memory needs; at most some."""
     if wanted is None:
         return min(block_count(source, memory, merging=merging), most)
-    check_whole(wanted, "blocks")
-    return min(whole_number(wanted), most)
+    return min(checked_whole(wanted, "blocks"), most)
 
 
 def worker_count(memory: int, wanted: int | None) -> int:

@@ -15,8 +15,9 @@ from cvtgs.cameras import Cameras
 from cvtgs.checks import checked
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
-from cvtgs.counts import check_whole, shared_out, shortfall, target_count, whole_number
+from cvtgs.counts import checked_whole, shared_out, shortfall, target_count, whole_number
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
+from cvtgs.edit import concatenate
 from cvtgs.errors import ConfigError, DroppedDataWarning, check_path, warn
 from cvtgs.evaluation.scorer import check_seen
 from cvtgs.grouping import finer_count
@@ -50,7 +51,7 @@ from cvtgs.prepared import check_cameras
 from cvtgs.processes import Result, Workers, with_progress
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport, origin_of_views
-from cvtgs.scene import GaussianScene, concatenate
+from cvtgs.scene import GaussianScene
 from cvtgs.simplifier import Simplifier
 from cvtgs.views import find_own_cameras
 
@@ -146,7 +147,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     check_memory(memory, with_images=simplifier.config.uses_images)
     if range_rows is None:
         range_rows = rows_per_range(rows.count)
-    check_whole(range_rows, "range_rows")
+    range_rows = checked_whole(range_rows, "range_rows")
     memory = None if memory is None else whole_number(memory)
     room = memory or memory_to_plan()
     if simplifier.config.uses_images:

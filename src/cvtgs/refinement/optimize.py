@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cvtgs.analysis import ambient_visibility
 from cvtgs.config import Rates, RefineConfig
-from cvtgs.counts import check_whole, real_number
+from cvtgs.counts import checked_whole, real_number
 from cvtgs.cvt import nearest_site
 from cvtgs.cvt.nearest import runs_of_equal
 from cvtgs.errors import InvalidArgumentError
@@ -51,11 +51,11 @@ class Limits:
                 f"the refinement time in seconds must be above 0 and finite, found {seconds!r}."
             )
         if steps is not None:
-            check_whole(steps, "the number of refinement steps")
+            steps = checked_whole(steps, "the number of refinement steps")
         self._start = time.perf_counter()
         self._last = self._start
         self._seconds = None if seconds is None else float(seconds)  # also one of numpy
-        self._steps = None if steps is None else int(steps)
+        self._steps = steps
         self._slowest = {"step": 0.0, "check": 0.0}
         self.steps = 0
 

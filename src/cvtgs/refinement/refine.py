@@ -9,9 +9,9 @@ from torch import Tensor
 from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock, check_listener
 from cvtgs.config import RefineConfig
-from cvtgs.counts import check_whole
+from cvtgs.counts import checked_whole
 from cvtgs.devices import chosen_device, threads_for_chunks, without_autocast
-from cvtgs.errors import InvalidArgumentError, InvalidSceneError
+from cvtgs.errors import InvalidArgumentError, InvalidSceneError, warn
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer, check_seen
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.refinement.images import ImageBuffer, generated_views, shared_views, split_views
@@ -66,7 +66,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
 
     The same scenes, steps, configuration and seed give the same bits on a CPU; with ``seconds``
     the number of steps depends on the clock. The time includes everything, even the compilation
-    of numba code at its first use on a machine, some ten seconds.
+    of numba code at its first use on a machine, some ten seconds. Views and held-out images come
+    first, a second or more on a CPU; if then no step fits, a warning says so.
 
     Memory: ten times the small scene, 80 more bytes per Gaussian for each further image of a step,
     the memory for rendering the full scene, and the reused images (those of given cameras), at most
@@ -75,7 +76,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     Args:
         small: The simplified scene; it is not changed.
         full: The scene that it was made from.
-        seconds: Largest wall-clock time, seconds.
+        seconds: Wall-clock time, seconds; a step that would exceed it is not taken.
         steps: Largest number of steps; if neither is given, the configuration decides, with more
             for few Gaussians if ``config.lengthening`` says so, else 500.
         cameras: The views, at least 2; an eighth of them, from 1 to ``config.heldout``, is held
@@ -121,7 +122,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         seconds = config.seconds or None
         steps = config.steps or (DEFAULT_STEPS if seconds is None else None)
     limits = Limits(seconds, steps=steps)
-    check_whole(frozen, "frozen", least=0, most=len(small), things="Gaussians")
+    frozen = checked_whole(frozen, "frozen", least=0, most=len(small), things="Gaussians")
     check_listener(listener)
     if observed is not None:
         check_observed(observed, "observed")
@@ -175,6 +176,12 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
             listener=listener,
         )
         refined = ours if found.scene is drawn else _with_rows(ours, valid, found.scene)
+    cost = clock.costs[0]
+    if found.stopped == "time" and limits.steps == 0:
+        warn(
+            f"no step of the refinement fits into {seconds:g} s, so the scene is unchanged; views "
+            f"and held-out images took {cost.seconds:.1f} s."
+        )
     report = RefineReport(
         steps=limits.steps,
         images=images.rendered,
@@ -186,7 +193,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         stopped=found.stopped,
         backend=choose_backend("auto", place)[0],
         device=str(place),
-        cost=clock.costs[0],
+        cost=cost,
     )
     return Refined(small if refined is ours else refined.to(small.device), report)
 
@@ -214,8 +221,9 @@ def changed_count(before: GaussianScene, after: GaussianScene) -> int:
 
 def _with_rows(scene: GaussianScene, rows: Bool[Tensor, "n"], part: GaussianScene) -> GaussianScene:
     """Return a scene with other values of some rows."""
+    new = part.tensors()
     tensors = {
-        name: old.masked_scatter(rows.view(-1, *[1] * (old.ndim - 1)), part.tensors()[name])
+        name: old.detach().masked_scatter(rows.view(-1, *[1] * (old.ndim - 1)), new[name])
         for name, old in scene.tensors().items()
     }
     return scene.with_tensors(tensors)

@@ -366,12 +366,13 @@ def blending_weights(
 def _degree(scene: GaussianScene, sh_degree: int | None) -> int:
     if sh_degree is None:
         return scene.sh_degree
-    if not 0 <= whole_number(sh_degree) <= scene.sh_degree:
+    degree = whole_number(sh_degree)
+    if not 0 <= degree <= scene.sh_degree:
         raise InvalidArgumentError(
             f"sh_degree must be from 0 to {scene.sh_degree}, the degree of the scene, "
             f"found {sh_degree!r}."
         )
-    return sh_degree
+    return degree
 
 
 def _background(

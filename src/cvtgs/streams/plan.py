@@ -147,8 +147,9 @@ def plan_stream(
         replaces it.
 
     Raises:
-        InvalidArgumentError: There is no level, two have the same size, chunks would be empty, or
-            the distance of the environment is no number from 0.
+        InvalidArgumentError: There is no level, two have the same size, they are of scenes of
+            different sizes, chunks would be empty, or the distance of the environment is no number
+            from 0.
 
     Example:
         >>> from cvtgs import Simplifier, synthetic
@@ -158,6 +159,16 @@ def plan_stream(
         250
     """
     check_environment(environment_radii)
+    for level in levels:
+        if not hasattr(level, "assignment"):
+            raise InvalidArgumentError(
+                f"levels must be those that Simplifier.levels returns, found {shown(level)}."
+            )
+    sizes = sorted({len(_assignment(level)) for level in levels})
+    if len(sizes) > 1:
+        raise InvalidArgumentError(
+            f"levels must be of one scene, found scenes of {sizes[0]:,} and {sizes[1]:,} Gaussians."
+        )
     ordered = tuple(sorted(levels, key=lambda level: -len(level.scene)))
     counts = [len(level.scene) for level in ordered]
     if not counts or len(set(counts)) < len(counts) or whole_number(chunk_gaussians) < 1:

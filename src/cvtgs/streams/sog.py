@@ -13,14 +13,15 @@ from torch import Tensor
 
 from cvtgs.boxes import Corner
 from cvtgs.checks import checked
-from cvtgs.counts import check_whole
+from cvtgs.counts import checked_whole
 from cvtgs.devices import on_host
+from cvtgs.edit import concatenate
 from cvtgs.io import load, save
 from cvtgs.io.atomic import make_folder, write_atomically
 from cvtgs.io.limits import FORMAT_LIMITS, dropped_within
 from cvtgs.io.sog import encode_sog
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.scene import GaussianScene, concatenate
+from cvtgs.scene import GaussianScene
 from cvtgs.streams.files import StreamLevel, StreamPart, join_levels, join_trees, write_stream
 from cvtgs.streams.plan import StreamNode, StreamPlan, environment_level
 
@@ -153,7 +154,7 @@ def write_sog_stream(
         ...     [len(cvtgs.load(folder, lod=lod)) for lod in (0, 1)]
         [250, 25]
     """
-    check_whole(file_gaussians, "file_gaussians")
+    file_gaussians = checked_whole(file_gaussians, "file_gaussians")
     form = SogFormat(file_gaussians=file_gaussians)
     return write_stream(form, plan, folder, overwrite=overwrite, listener=listener)
 

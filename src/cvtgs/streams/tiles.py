@@ -12,7 +12,7 @@ import torch
 
 from cvtgs.boxes import Corner
 from cvtgs.checks import checked
-from cvtgs.counts import check_whole, real_number
+from cvtgs.counts import checked_whole, real_number
 from cvtgs.devices import on_host
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io import atomic_output
@@ -159,7 +159,7 @@ def write_tiles(
         ...     len(cvtgs.load(f"{folder}/0_0.glb")), written[0].gaussians
         (25, 250)
     """
-    check_whole(tile_gaussians, "tile_gaussians")
+    tile_gaussians = checked_whole(tile_gaussians, "tile_gaussians")
     check_no_environment(bool(plan.far))
     form = TilesFormat(
         tile_gaussians=tile_gaussians,

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
+from cvtgs.counts import checked_whole
 from cvtgs.devices import one_thread
 from cvtgs.scene import SceneLike
 from cvtgs.views.layout import SceneLayout, level_axes
@@ -191,7 +192,8 @@ def automatic_views(
         >>> automatic_views(scene("object", 1000), 3, width=64, height=48).names
         ('view 1', 'view 2', 'view 3')
     """
-    seed = checked_seed(seed, count=count, width=width, height=height)
+    seed, count = checked_seed(seed), checked_whole(count, "count")
+    width, height = checked_whole(width, "width"), checked_whole(height, "height")
     size, turn = (width, height), 0.5 + seed * _GOLDEN
     with one_thread():
         positions = as_positions(scene)

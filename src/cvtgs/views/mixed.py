@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras, join_cameras, look_at
-from cvtgs.counts import check_whole
+from cvtgs.counts import checked_whole
 from cvtgs.scene import SceneLike
 from cvtgs.views.automatic import automatic_views
 from cvtgs.views.positions import CameraPositions, as_positions, checked_seed
@@ -66,8 +66,8 @@ def random_views(
         >>> len(random_views(scene("object", 1000), 3, size=64, seed=0))
         3
     """
-    seed = checked_seed(seed, size=size)
-    check_whole(count, "count", least=0)
+    seed, size = checked_seed(seed), checked_whole(size, "size")
+    count = checked_whole(count, "count", least=0)
     positions = as_positions(scene)
     layout = positions.layout
     eyes = positions.near(count, reach, seed)
@@ -139,7 +139,8 @@ def mixed_views(
         >>> len(mixed_views(scene("object", 1000), 5, size=64))
         5
     """
-    seed = checked_seed(seed, count=count, size=size)
+    seed = checked_seed(seed)
+    count, size = checked_whole(count, "count"), checked_whole(size, "size")
     positions = as_positions(scene)
     usual, near = max(1, count // 4), count // 4
     times = TRIED if sharp else 1

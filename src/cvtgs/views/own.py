@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import CvtgsError, FileFormatError, check_path, warn
-from cvtgs.scene import GaussianScene, check_scene
+from cvtgs.scene import GaussianScene, SceneLike, as_scene
 
 _LEAST_SEEN = 0.01  # share of the visible Gaussians in the image of a camera that looks at a scene
 _LEAST_LOOKING = 0.5
@@ -41,7 +41,7 @@ class OwnCameras(NamedTuple):
         return cameras if _LEAST_TEST <= len(cameras) < len(self.cameras) else None
 
 
-def find_own_cameras(scene: GaussianScene, path: str | os.PathLike[str]) -> OwnCameras | None:
+def find_own_cameras(scene: SceneLike, path: str | os.PathLike[str]) -> OwnCameras | None:
     """Read the cameras stored beside a scene, if they look at it.
 
     The folder of the model (in INRIA's layout the one above ``point_cloud``) and then the folder of
@@ -50,7 +50,7 @@ def find_own_cameras(scene: GaussianScene, path: str | os.PathLike[str]) -> OwnC
     must have a hundredth of the visible Gaussians in their images. A damaged file causes a warning.
 
     Args:
-        scene: The scene, as it was read.
+        scene: The scene, as it was read, or its path.
         path: The file or folder that it was read from.
 
     Returns:
@@ -68,7 +68,7 @@ def find_own_cameras(scene: GaussianScene, path: str | os.PathLike[str]) -> OwnC
     """
     from cvtgs.io import load_cameras  # noqa: PLC0415 (a scene in memory needs no formats)
 
-    check_scene(scene)
+    scene = as_scene(scene)
     check_path(path)
     place, faults = Path(path), set[str]()
     for source in _sources(place) if place.exists() else ():

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 from operator import index
@@ -11,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.counts import check_whole, real_number
+from cvtgs.counts import is_truth_value, real_number
 from cvtgs.devices import HOST, in_chunks
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
@@ -209,14 +210,12 @@ def _standing_eyes(layout: SceneLayout) -> Float[Tensor, "c 3"]:
     return center + distances * level + (ground + heights) * layout.up
 
 
-def checked_seed(seed: int, **sizes: int) -> int:
-    """Return a seed in the range of random generators; raise unless it and the sizes are valid."""
-    for name, value in sizes.items():
-        check_whole(value, name)
-    try:
-        return index(seed) % _SEEDS
-    except TypeError:
-        raise InvalidArgumentError(f"seed must be a whole number, found {shown(seed)}.") from None
+def checked_seed(seed: int) -> int:
+    """Return a seed in the range of random generators; raise unless it is a whole number."""
+    with suppress(TypeError):
+        if not is_truth_value(seed):
+            return index(seed) % _SEEDS
+    raise InvalidArgumentError(f"seed must be a whole number, found {shown(seed)}.")
 
 
 def as_positions(scene: SceneLike | CameraPositions) -> CameraPositions:
