@@ -53,6 +53,24 @@ _MARKUP = re.compile(r"[!-/:-@\[-`{-~]")
 
 _ADVICE = "free some, or choose another preset"
 
+_CLASSIC_WORKERS = """
+if (location.protocol === "file:") {
+  const Original = Worker;
+  window.Worker = function (url, options) {
+    if (options?.type !== "module" || !String(url).startsWith("blob:")) {
+      return new Original(url, options);
+    }
+    const request = new XMLHttpRequest();
+    request.open("GET", url, false);
+    request.send();
+    const code = request.responseText.replaceAll("import.meta.url", "self.location.href");
+    return new Original(URL.createObjectURL(new Blob([code], { type: "text/javascript" })));
+  };
+}
+"""
+"""Chromium starts no worker that is a module in a page that was opened as a file. viser's worker
+sorts the Gaussians; without it, they are blended in any order."""
+
 _GIVE_UP = 0.5  # seconds between checks whether the server was closed
 
 
@@ -123,7 +141,8 @@ def record_page(server: "viser.ViserServer", nodes: Sequence[SceneNode]) -> str:
     names = shortened(", ".join(node.name for node in nodes), 120)
     title = f"<title>Scenes in 3D: {escape(names)}</title>"
     page = str(recorder.as_html(dark_mode=True))
-    return re.sub("<title>.*?</title>", lambda _: title, page, count=1)
+    page = re.sub("<title>.*?</title>", lambda _: title, page, count=1)
+    return page.replace("<head>", f"<head><script>{_CLASSIC_WORKERS}</script>", 1)
 
 
 def look_at(server: "viser.ViserServer", scene: GaussianScene) -> Point:
