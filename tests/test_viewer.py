@@ -343,9 +343,9 @@ def test_a_page_does_not_replace_a_scene(
     one, other = tmp_path / "a.ply", tmp_path / "b.ply"
     save(scene, one)
     save(scene, other)
-    for page in (one, other):
-        words = ["view", str(one), str(other), "--page", str(page), "--overwrite"]
-        assert main(words) == 1
+    for path in (one, other):
+        (page := path.with_suffix(".html")).symlink_to(path)
+        assert main(["view", str(one), str(other), "--page", str(page), "--overwrite"]) == 1
         assert "--page and the scenes must be different files, found" in capsys.readouterr().err
     assert len(load(one)) == len(load(other)) == len(scene)
 

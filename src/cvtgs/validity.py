@@ -27,6 +27,8 @@ MAX_MEAN = torch.finfo(torch.float32).max  # files and renderers hold float32
 MAX_LOG_SCALE = math.log(MAX_MEAN)  # the logarithm of the largest float32 scale
 _FAR = 1e6  # distance from the origin at which float32 has a resolution of a sixteenth of a unit
 
+_HARMLESS = 1 / 16  # share of a standard deviation by which a Gaussian may move unseen
+
 
 class CheckedScene(NamedTuple):
     """The valid rows of a scene, and the number of dropped rows.
@@ -178,11 +180,18 @@ def standardized(scene: GaussianScene) -> GaussianScene:
 
 
 def lost_step(scene: GaussianScene) -> float:
-    """Return the step between float32 coordinates far from the origin; 0 where it is harmless."""
+    """Return the step between float32 coordinates far from the origin; 0 where it is harmless.
+
+    It is harmless if it is small beside the median standard deviation of the Gaussians.
+    """
     if len(scene) == 0 or scene.means.element_size() > 4:
         return 0.0
     far = float(scene.means.nanmedian(dim=0).values.abs().amax())
-    return 2.0 ** (math.floor(math.log2(far)) - 23) if _FAR <= far < math.inf else 0.0
+    if not _FAR <= far < math.inf:
+        return 0.0
+    step = 2.0 ** (math.floor(math.log2(far)) - 23)
+    typical = math.exp(float(scene.log_scales.amax(dim=1).nanmedian().clamp(max=MAX_LOG_SCALE)))
+    return step if step > _HARMLESS * typical else 0.0
 
 
 def warn_of_lost_digits(scene: GaussianScene) -> None:

@@ -162,3 +162,5 @@ def test_lost_digits_of_moved_positions_are_printed(
     converted(tmp_path, "--translate", "500000,4000000,0")
     printed = " ".join(capsys.readouterr().out.split())
     assert "Lost: digits of positions (steps of 0.25 so far from the origin)." in printed
+    converted(tmp_path, "--scale", "1e8")
+    assert "Lost: nothing." in capsys.readouterr().out

@@ -354,6 +354,20 @@ def test_a_signal_ignored_in_a_destructor_is_sent_again(tmp_path, monkeypatch, c
     assert capsys.readouterr().err == "cvtgs: interrupted; no incomplete file is left.\n"
 
 
+def test_an_interrupt_waits_until_torch_is_loaded(monkeypatch, capsys):
+    done = []
+
+    def load():
+        signal.raise_signal(signal.SIGINT)
+        done.append("loaded")
+
+    monkeypatch.setattr("cvtgs.cli.main.load_torch", load)
+    monkeypatch.setattr("cvtgs.cli.files.show_info", done.append)
+    assert main(["info", "a.ply"]) == 130
+    assert done == ["loaded"]
+    assert capsys.readouterr().err == "cvtgs: interrupted; no incomplete file is left.\n"
+
+
 def test_an_interrupt_turned_into_another_error_stays_one(monkeypatch, capsys):
     def run(options):
         try:

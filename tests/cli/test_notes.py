@@ -220,3 +220,15 @@ def test_dropped_rows_are_counted_with_separators(capsys, source):
         "dropped 1,100 of 1,200 Gaussians with NaN, infinite or zero values (means 1,100)" in text
     )
     assert "Fewer than the requested 600: only 100 of 1,200 Gaussians are valid." in text
+
+
+@pytest.mark.parametrize(("name", "is_said"), [("a.ply", False), ("a.sog", True), ("a.spz", True)])
+def test_formats_that_change_protected_gaussians_are_mentioned(
+    capsys: pytest.CaptureFixture[str], source: Path, name: str, is_said: bool
+) -> None:
+    box = source.with_name("box.json")
+    box.write_text('{"min": [0, -9, -9], "max": [9, 9, 9]}')
+    words = ["--rho", "0.8", "--preset", "draft", "--keep", box]
+    said = printed(capsys, "simplify", source, source.with_name(name), *words)
+    assert "in the boxes of --keep" in said
+    assert ("Only a plain .ply has them first" in said) == is_said

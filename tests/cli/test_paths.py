@@ -38,6 +38,10 @@ from scenes import random_scene
             ["simplify", "a.ply", "b.ply", "--rho", "0.1", "--report", "-"],
             "argument --report: must be a file, found '-'; ./- is a file of this name",
         ),
+        (
+            ["view", "a.ply", "--page", "page.JSON"],
+            "argument --page: must be a .html file, found 'page.JSON'",
+        ),
     ],
 )
 def test_words_that_are_no_paths_are_usage_errors(capsys, tmp_path, monkeypatch, words, text):

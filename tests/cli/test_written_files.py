@@ -46,10 +46,15 @@ def test_the_report_never_replaces_another_file(
     if other == "--config":
         taken.write_text("seed = 3\n")
         before = taken.read_bytes()
-    assert main([*words, "--report", str(report)]) == 1
-    assert capsys.readouterr().err == (
-        f"cvtgs: error: --report and {other} must be different files, found {report} for both.\n"
-    )
+    words += ["--report", str(report)]
+    if report.suffix == ".ply":
+        with pytest.raises(SystemExit, match="2"):
+            main(words)
+        said = f"argument --report: must be a .json file, found {str(report)!r}\n"
+    else:
+        assert main(words) == 1
+        said = f"--report and {other} must be different files, found {report} for both.\n"
+    assert capsys.readouterr().err.endswith(f" error: {said}")
     assert (taken.read_bytes() if taken.exists() else None) == before
 
 

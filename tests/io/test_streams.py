@@ -198,6 +198,20 @@ def test_damaged_streams_are_refused(content: bytes, error: type[Exception], tex
     assert text in str(caught.value)
 
 
+def test_a_stream_of_another_kind_is_refused_by_its_first_bytes() -> None:
+    class Endless(io.RawIOBase):
+        count = 0
+
+        def read(self, size: int = -1, /) -> bytes:
+            self.count += 1
+            return b"x" * min(size, 3)
+
+    stream = Endless()
+    with pytest.raises(FileFormatError, match="found b'xxxx'"):
+        cvtgs.load(stream)
+    assert stream.count == 2
+
+
 def test_text_files_and_closed_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"must be open in binary mode, found text"):
         cvtgs.load(io.StringIO("ply"))  # type: ignore[arg-type]
@@ -287,10 +301,12 @@ def test_no_room_for_a_copy_of_a_stream_is_an_error_of_the_folder(
         OutputError, match="folder of temporary files must be writable and have room for"
     ):
         cvtgs.load(content)
+    content.seek(0)
     monkeypatch.setattr(tempfile, "tempdir", None)
     monkeypatch.setattr(tempfile, "_candidate_tempdir_list", list)
     with pytest.raises(OutputError, match="found: no usable temporary directory found"):
         cvtgs.load(content)
+    content.seek(0)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))

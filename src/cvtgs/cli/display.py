@@ -107,9 +107,10 @@ def target_note(found: "Found", config: "SimplifyConfig", *, is_given: bool) -> 
     views = "the given cameras" if is_given else "automatic views"
     if config.uses_images:
         views = "automatic views that it was not fitted to"
+    tries = "1 try" if len(found.tried) == 1 else f"{len(found.tried)} tries"
     return (
         f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f}, alpha error {found.alpha_error:.4f} "
-        f"(bias {found.alpha_bias:+.4f}) over {views}; found in {len(found.tried)} tries."
+        f"(bias {found.alpha_bias:+.4f}) over {views}; found in {tries}."
     )
 
 

@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         warnings.showwarning = _show_warning
         warnings.simplefilter("always", UserWarning)
         try:
-            _run(sys.argv[1:] if arguments is None else arguments)
+            _run(sys.argv[1:] if arguments is None else arguments, stop)
         except (KeyboardInterrupt, Exception) as error:
             # An interrupted import may raise another error instead of KeyboardInterrupt.
             if stop.code is not None:
@@ -74,7 +74,7 @@ def _is_closed_pipe(error: BaseException | None) -> bool:
     return isinstance(error, BrokenPipeError)
 
 
-def _run(words: Sequence[str]) -> None:
+def _run(words: Sequence[str], stop: "_Stop") -> None:
     parser = build_parser()
     if not words:
         parser.exit(2, parser.format_help())
@@ -84,7 +84,8 @@ def _run(words: Sequence[str]) -> None:
         flush_output()
         raise
     if options.command != "completion":  # needs no tensors, and starts faster without them
-        load_torch()
+        with stop.held():  # an interrupted import of torch may end in its C++ code
+            load_torch()
     otherwise = BLOCKS_ADVICE if hasattr(options, "memory") else "ask for less"
     advice = f"free some, or {otherwise}, and use --device cpu if a GPU ran out"
     advised = memory_errors(f"cvtgs {options.command}", advice)
@@ -167,10 +168,23 @@ class _Stop:
 
     def __init__(self) -> None:
         self.code: int | None = None
+        self.is_held = False
 
     def __call__(self, signum: int, frame: FrameType | None) -> None:
         self.code = INTERRUPTED if signum == signal.SIGINT else TERMINATED
-        raise KeyboardInterrupt
+        if not self.is_held:
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Raise at the end of the context what would be raised within it."""
+        self.is_held = True
+        try:
+            yield
+        finally:
+            self.is_held = False
+        if self.code is not None:
+            raise KeyboardInterrupt
 
     def notice(self, event: "sys.UnraisableHookArgs") -> None:
         """Send the signal again if its exception was raised where Python ignores exceptions."""

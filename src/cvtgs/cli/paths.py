@@ -17,12 +17,14 @@ def any_path(text: str) -> Path:
     return Path(text)
 
 
-def new_file(text: str) -> Path:
-    """Read the path of a file to write, which standard output cannot replace."""
+def new_file(text: str, kind: str) -> Path:
+    """Read the path of a file of a kind to write, which standard output cannot replace."""
     if text.endswith(("/", os.sep)):
         raise argparse.ArgumentTypeError(f"must be a file, found the folder {text!r}")
     if text == "-":
         raise argparse.ArgumentTypeError("must be a file, found '-'; ./- is a file of this name")
+    if text.lower().endswith(FILE_SUFFIXES) and not text.lower().endswith(kind):
+        raise argparse.ArgumentTypeError(f"must be a {kind} file, found {text!r}")
     return any_path(text)
 
 

@@ -3,6 +3,7 @@
 import argparse
 import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -131,12 +132,15 @@ def add_simplify(add_parser: AddParser) -> None:
         "--keep",
         type=any_path,
         metavar="BOX.json",
-        help="boxes whose Gaussians stay unchanged; they come first in OUT and count towards its "
-        'size: {"min": [x, y, z], "max": [x, y, z]}, or a list of these',
+        help="boxes whose Gaussians stay unchanged; they come first in a .ply OUT and count "
+        'towards its size: {"min": [x, y, z], "max": [x, y, z]}, or a list of these',
     )
     add_block_options(parser)
     parser.add_argument(
-        "--report", type=new_file, metavar="R.json", help="file for a JSON report of the run"
+        "--report",
+        type=partial(new_file, kind=".json"),
+        metavar="R.json",
+        help="file for a JSON report of the run",
     )
     add_options(parser, "--sh-degree", "--axes", "--lod", "--device", "--trust-sizes")
     add_options(parser, "--overwrite", "--quiet")
@@ -194,6 +198,9 @@ def _simplify_one(
         notes.append("In one piece: --memory has an effect on binary .ply files only.")
     if report.kept_count:
         notes.append(f"{counted(report.kept_count, 'Gaussian')} in the boxes of --keep.")
+        name = options.output.name.lower()
+        if name.endswith(".compressed.ply") or not name.endswith(".ply"):
+            notes.append("Only a plain .ply has them first, and bit for bit as they were.")
     elif options.keep is not None:
         warn(f"{options.keep}: no Gaussian is in the boxes of --keep, so none is protected.")
     total = time.perf_counter() - options.begun if searched else report.seconds

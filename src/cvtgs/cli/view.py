@@ -3,6 +3,7 @@
 import argparse
 import webbrowser
 from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING
 
 import cvtgs
@@ -57,7 +58,7 @@ def add_view(add_parser: AddParser) -> None:
     )
     parser.add_argument(
         "--page",
-        type=new_file,
+        type=partial(new_file, kind=".html"),
         metavar="F.html",
         help="write the page to a file that needs no server, instead of serving it; its time line "
         "switches between the scenes",

@@ -45,7 +45,8 @@ class EffectsConfig(Section):
         flat: Whether a scene of Gaussians with two scales (2DGS) keeps two scales.
         duplicates: Whether Gaussians at exactly the same position share one search.
         extras: Whether columns beyond the standard ones are carried along.
-        visibility: Whether images are rendered if the preset asks for them.
+        visibility: Whether images for contributions and matching are rendered if the preset asks
+            for them; refinement has its own.
     """
 
     sh: Degree = "auto"

@@ -18,6 +18,7 @@ MEMORY_BYTES = 1 << 26  # a file is built in memory up to this size, and on disk
 CHUNK_BYTES = 1 << 16  # bytes of a stream that are read at once
 
 _FIRST_BYTES = {b"ply": ".ply", b"\x1f\x8b": ".spz", b"NGSP": ".spz", b"glTF": ".glb"}
+_MOST_FIRST_BYTES = max(map(len, _FIRST_BYTES))
 _TORCH_MEMBER = re.compile(r"[^/]+/data\.pkl")
 
 
@@ -51,13 +52,19 @@ def file_of(
     its own name. ``advice`` ends the error message if the first bytes match no format.
     """
     name = name or name_of(stream)
+    chunks, start = _chunks(stream, name), b""
+    while len(start) < _MOST_FIRST_BYTES and (chunk := next(chunks, b"")):
+        start += chunk
+    if format is None:
+        _check_start(start, name, advice)
     with ExitStack() as stack:
         try:
             temporary = TemporaryDirectory(prefix="cvtgs-", ignore_cleanup_errors=True)
             folder = stack.enter_context(temporary)
             path = Path(folder) / "stream"
             with path.open("xb") as file:
-                for chunk in _chunks(stream, name):
+                file.write(start)
+                for chunk in chunks:
                     file.write(chunk)
         except InputError:
             raise
@@ -66,7 +73,7 @@ def file_of(
                 f"the folder of temporary files must be writable and have room for a copy of "
                 f"{name}, found: {reason_of(error)}; TMPDIR sets another folder."
             ) from error
-        suffix = format or _format_of(path, name, advice)
+        suffix = format or _format_of(path, start)
         path = path.rename(path.with_name(f"stream{suffix}"))
         stack.enter_context(named_in_warnings(path, name))
         try:
@@ -154,18 +161,20 @@ def copy_to(stream: ByteSink, file: BinaryIO) -> None:
             count = stream.write(chunk)
 
 
-def _format_of(path: Path, name: str, advice: str) -> str:
-    """Return the suffix of the format that the content of a file shows."""
-    with path.open("rb") as file:
-        first = file.read(4)
-    for start, suffix in _FIRST_BYTES.items():
-        if first.startswith(start):
-            return suffix
-    if not first.startswith(b"PK"):
+def _check_start(start: bytes, name: str, advice: str) -> None:
+    """Check that the first bytes of a stream are those of a known format."""
+    if not start.startswith((b"PK", *_FIRST_BYTES)):
         raise FileFormatError(
             f"{name}: the first bytes must be those of a .ply, .spz, .sog, .glb or .pt, found "
-            f"{first!r}; {advice}."
+            f"{start[:_MOST_FIRST_BYTES]!r}; {advice}."
         )
+
+
+def _format_of(path: Path, start: bytes) -> str:
+    """Return the suffix of the format that the content of a file and its first bytes show."""
+    for first, suffix in _FIRST_BYTES.items():
+        if start.startswith(first):
+            return suffix
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()

@@ -234,7 +234,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
         raise InvalidArgumentError(
             f"a stream needs levels of different sizes and chunks of at least one Gaussian, found "
             f"ratios {ratios} of {counted(rows.count, 'Gaussian')} and chunks of "
-            f"{shown(chunk_gaussians)}."
+            f"{shown(chunk_gaussians)}; other ratios help a small scene."
         )
     merged = [target for target in targets if target < rows.count] or targets
     room = memory or memory_to_plan()

@@ -174,7 +174,8 @@ def plan_stream(
     if not counts or len(set(counts)) < len(counts) or whole_number(chunk_gaussians) < 1:
         raise InvalidArgumentError(
             f"a stream needs levels of different sizes and chunks of at least one Gaussian, found "
-            f"levels of {counts} and chunks of {shown(chunk_gaussians)}."
+            f"levels of {counts} and chunks of {shown(chunk_gaussians)}; other ratios help a "
+            f"small scene."
         )
     near = near_rows(ordered[-1].scene, robust_frame(ordered[0].scene.means), environment_radii)
     return plan_part(ordered, near, chunk_gaussians=chunk_gaussians)

@@ -201,9 +201,6 @@ def cells(tradeoff: Tradeoff, result: TradeoffResult) -> Mapping[str, str]:
     distance = {"LPIPS": _score(result, "lpips", 4)} if measured else {}
     return {
         "preset": result.preset,
-        "start, s": _seconds(tradeoff.start_seconds),
-        **stages,
-        "read, write, s": _seconds(tradeoff.rest_seconds(result)),
         "all, s": _seconds(result.seconds),
         "PSNR, dB": _score(result, "psnr", 2),
         "SSIM": _score(result, "ssim", 4),
@@ -213,6 +210,9 @@ def cells(tradeoff: Tradeoff, result: TradeoffResult) -> Mapping[str, str]:
         "alpha bias": "" if result.alpha_bias is None else f"{result.alpha_bias:+.4f}",
         "file": size_text(result.bytes),
         "memory": size_text(result.peak_memory_bytes) if result.peak_memory_bytes else "",
+        "start, s": _seconds(tradeoff.start_seconds),
+        **stages,
+        "read, write, s": _seconds(tradeoff.rest_seconds(result)),
     }
 
 
