@@ -9,9 +9,9 @@ from block_jobs import unfinished_job
 from cvtgs import SimplifyConfig
 from cvtgs.analysis import analyze
 from cvtgs.cells import gaussian_moments, merge_pairs, view_components
-from cvtgs.cells.moments import LARGEST_COLOR, MAX_COMPONENTS, view_colors
+from cvtgs.cells.moments import MAX_COMPONENTS, view_colors
 from cvtgs.config import AllocationConfig
-from cvtgs.math.spherical_harmonics import rest_basis
+from cvtgs.math.spherical_harmonics import LARGEST_COLOR, rest_basis
 from scenes import moved, random_scene
 
 COUNT = 2000

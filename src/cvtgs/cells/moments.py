@@ -11,16 +11,13 @@ from cvtgs.devices import HOST, in_chunks, move_together, one_thread
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.parameters import normalize_quats, quats_to_matrices
 from cvtgs.math.segments import label_sums, take_columns
-from cvtgs.math.spherical_harmonics import SH_C0
+from cvtgs.math.spherical_harmonics import LARGEST_COLOR, SH_C0
 from cvtgs.scene import GaussianScene
 
 CHUNK = 1 << 14  # Gaussians per chunk, of which a few columns fit into a cache
 
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Row and column of the six distinct entries of a symmetric matrix."""
-
-LARGEST_COLOR = 1.5
-"""Limit of a colour, and of the norm of coefficients, so that a few extreme ones do not decide."""
 
 MAX_COMPONENTS = 12  # largest number of components
 LEAST_SPREAD = 0.01  # smallest standard deviation of a component that counts, in units of RGB

@@ -8,14 +8,12 @@ from cvtgs.checks import checked
 from cvtgs.counts import check_share
 from cvtgs.devices import row_chunks
 from cvtgs.math.frames import RobustFrame
-from cvtgs.math.spherical_harmonics import SH_C0
+from cvtgs.math.spherical_harmonics import LARGEST_COLOR, SH_C0
 
 CHUNK = 1 << 16  # Gaussians per chunk of the embedding, to bound memory
 
 FARTHEST = 1e30
 """Coordinates are clamped to this, in robust radii, so that flyaways cannot overflow float32."""
-
-COLOR_HEADROOM = 0.5  # colours are clamped at 1 plus this
 
 
 @checked
@@ -56,7 +54,7 @@ def embed(
         position = frame.contract(local, contraction) if contraction else frame.normalize(local)
         points[part, :3] = position.clamp_(-FARTHEST, FARTHEST)
         if sh0 is not None and colored:
-            rgb = (SH_C0 * sh0[part, 0].double()).clamp(-0.5, 0.5 + COLOR_HEADROOM)
+            rgb = (SH_C0 * sh0[part, 0].double()).clamp(-0.5, LARGEST_COLOR - 0.5)
             points[part, 3:] = color * rgb
     return points
 

@@ -12,6 +12,9 @@ from cvtgs.errors import InvalidArgumentError
 SH_C0 = 0.5 / math.sqrt(math.pi)
 """The constant band: the colour of degree 0 is ``0.5 + SH_C0 * sh0``."""
 
+LARGEST_COLOR = 1.5
+"""Limit of a colour, and of the norm of coefficients, where distances between colours decide."""
+
 SH_C1 = math.sqrt(3 / (4 * math.pi))  # the factor of the three linear functions
 
 SH_C2 = (math.sqrt(15 / (4 * math.pi)), math.sqrt(5 / (16 * math.pi)))
