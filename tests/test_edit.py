@@ -50,6 +50,9 @@ def test_crop_keeps_the_rows_inside_unchanged() -> None:
 def test_points_on_its_surface_belong_to_a_sphere() -> None:
     scene = random_scene(2).with_tensors({"means": torch.tensor([[3.0, 4, 0], [3.001, 4, 0]])}, {})
     assert len(crop(scene, [Sphere(center=(0.0, 0.0, 0.0), radius=5.0)])) == 1
+    far = torch.tensor([[6e6, 0, 0], [6e6 + 0.5, 0, 0]])  # the centre is between float32 numbers
+    scene = scene.with_tensors({"means": far}, {})
+    assert len(crop(scene, [Sphere(center=(6000000.25, 0.0, 0.0), radius=0.3)])) == 2
 
 
 def test_faint_and_large_gaussians_are_dropped() -> None:

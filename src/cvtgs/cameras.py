@@ -187,8 +187,8 @@ class Cameras:
     def every(self, stride: int, *, first: tuple[int, int] = (0, 0)) -> Self:
         """Return cameras that see only every ``stride``-th pixel, as sharp as in the whole image.
 
-        They render ``image[:, row::stride, column::stride]``: splats keep the width that they have
-        in the whole image, while smaller images (:meth:`resized`) make them wider.
+        They render ``image[:, row::stride, column::stride]``, but for slight differences of splats
+        centred far outside. Splats are as wide as in the image, and wider in :meth:`resized` ones.
 
         Args:
             stride: Step between pixels, along rows and columns.

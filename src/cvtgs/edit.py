@@ -169,7 +169,8 @@ def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -
     keep = inside([region for region in regions if isinstance(region, Box)], scene.means)
     for region in regions:
         if isinstance(region, Sphere):
-            away = scene.means.double() - scene.means.new_tensor(region.center).double()
+            center = scene.means.new_tensor(region.center, dtype=torch.float64)
+            away = scene.means.double() - center
             keep |= away.square().sum(dim=1) <= region.radius * region.radius
     return _kept(scene, keep)
 

@@ -24,7 +24,7 @@ UNIT_TOLERANCE = 1e-5
 """Quaternions whose squared length differs from 1 by at most this count as unit quaternions."""
 
 MAX_MEAN = torch.finfo(torch.float32).max  # files and renderers hold float32
-MAX_LOG_SCALE = math.log(MAX_MEAN)  # the logarithm of the largest float32 scale
+MAX_LOG_SCALE = 88.72  # its exponential is finite in float32
 _FAR = 1e6  # distance from the origin at which float32 has a resolution of a sixteenth of a unit
 
 _HARMLESS = 1 / 16  # share of a standard deviation by which a Gaussian may move unseen

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -36,6 +37,19 @@ def test_no_heldout_camera_is_refused():
     none = automatic_views(scene, 1, width=32, height=24).select(torch.arange(0))
     with pytest.raises(InvalidArgumentError, match="heldout must hold at least one camera, found"):
         find_count(scene, psnr=20.0, heldout=none)
+
+
+def test_cameras_that_miss_the_scene_are_refused():
+    scene = cvtgs.synthetic.scene("object", 50, sh_degree=0)
+    views = automatic_views(scene, 2, width=32, height=24)
+    away = views.viewmats.clone()
+    away[:, 0, 3] += 1e4
+    means, logits = scene.means.clone(), scene.logit_opacities.clone()
+    means[0] = away[0, :3, :3].T @ (torch.tensor([0.0, 0.0, 3.0]) - away[0, :3, 3])
+    logits[0] = -8.0  # before a camera, but too faint to be drawn
+    scene = scene.with_tensors(means=means, logit_opacities=logits)
+    with pytest.raises(InvalidArgumentError, match="must see the scene, found nothing of it"):
+        find_count(scene, psnr=20.0, heldout=replace(views, viewmats=away))
 
 
 @pytest.mark.parametrize("wanted", [3.0, 17.0, 25.0, 31.4, 44.0])

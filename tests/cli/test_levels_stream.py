@@ -180,3 +180,15 @@ def test_a_page_shows_a_scene_that_is_named_like_a_level(tmp_path, monkeypatch):
     line = ["levels", str(path), "-o", str(tmp_path / "out"), "--rho", "0.5", "--no-scores"]
     assert main([*line, "--viewer"]) == 0
     assert {name: len(one) for name, one in shown.items()} == {str(path): 30, "rho_0.5.ply": 15}
+
+
+@pytest.mark.parametrize("axes", [[], ["--axes", "rub"]])
+def test_turned_scenes_are_not_scored_from_cameras_beside_them(
+    tmp_path: Path, words: list[str], axes: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    turn = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    entry = {"id": 0, "img_name": "a", "width": 48, "height": 36, "fx": 40.0, "fy": 40.0}
+    entries = [{**entry, "position": [x, 0, -4], "rotation": turn} for x in (0, 1)]
+    (tmp_path / "cameras.json").write_text(json.dumps(entries))
+    assert main([*words, "--rho", "0.1", *axes]) == 0
+    assert ("cameras found in" in capsys.readouterr().err) == (not axes)

@@ -15,6 +15,7 @@ import pytest
 import cvtgs
 from cvtgs.cli.main import build_parser, main
 from cvtgs.cli.options import PRESET_NAMES, READABLE, WRITABLE
+from cvtgs.cli.paths import FILE_SUFFIXES
 from cvtgs.io.formats import READABLE_SUFFIXES, WRITABLE_SUFFIXES
 
 
@@ -35,6 +36,7 @@ def test_help_names_every_command(capsys):
 def test_help_names_every_format():
     written, read = (set(re.findall(r"[\w-]*(?:\.\w+)+", text)) for text in (WRITABLE, READABLE))
     assert written == set(WRITABLE_SUFFIXES)
+    assert all(name.endswith(FILE_SUFFIXES) for name in written)
     assert read == {*READABLE_SUFFIXES, "meta.json", "lod-meta.json"}
 
 

@@ -55,3 +55,22 @@ def test_an_image_of_floats_is_refused(tmp_path):
     Image.fromarray(np.full((16, 16), 0.5, dtype=np.float32)).save(tmp_path / "a.tif")
     with pytest.raises(FileFormatError, match=r"a\.tif: must hold whole numbers, found an image"):
         read_image(tmp_path / "a.tif", (16, 16), (0.0, 0.0, 0.0))
+
+
+def test_upright_photographs_may_have_pixels_that_are_not_quite_square(tmp_path):
+    """The second camera was stretched from 120 x 160 to 160 x 120 pixels, with fy = 1.002 fx."""
+    first = torch.tensor([[150.0, 0, 80], [0, 150.3, 60], [0, 0, 1]])
+    second = torch.tensor([[200.0, 0, 80], [0, 112.725, 60], [0, 0, 1]])
+    cameras = cvtgs.Cameras(
+        viewmats=torch.eye(4).expand(2, 4, 4),
+        Ks=torch.stack([first, second]) * torch.tensor([10.0, 10.0, 1.0])[:, None],
+        width=1600,
+        height=1200,
+        names=("a", "b"),
+    )
+    for name, size in (("a", (1200, 1600)), ("b", (1600, 1200))):
+        (tmp_path / f"{name}.png").write_bytes(encode(np.zeros((*size, 3), np.uint8), "png"))
+    assert fit_cameras(cameras, tmp_path) is cameras
+    (tmp_path / "b.png").write_bytes(encode(np.zeros((1600, 1100, 3), np.uint8), "png"))
+    with pytest.raises(InvalidArgumentError, match="found 1100 x 1600"):
+        fit_cameras(cameras, tmp_path)

@@ -124,3 +124,11 @@ def test_a_few_flyaways_give_no_warning_of_a_far_scene():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         cvtgs.validity.warn_of_lost_digits(scene.with_tensors({"means": means}, {}))
+
+
+def test_the_largest_view_dependent_colours_of_a_sog_can_be_read_back(tmp_path):
+    """The mean of two float32 values of 2e38 is finite, their sum is not."""
+    scene = random_scene(2000, degree=1)
+    signs = torch.where(torch.arange(scene.shN.numel()).view(scene.shN.shape) % 3 > 0, 2e38, -2e38)
+    cvtgs.save(scene.with_tensors(shN=signs), tmp_path / "a.sog")
+    assert len(cvtgs.load(tmp_path / "a.sog")) == 2000

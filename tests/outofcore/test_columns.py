@@ -9,7 +9,9 @@ import cvtgs
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.boxes import Box, inside
 from cvtgs.cli.main import main
+from cvtgs.io.ply import open_rows
 from cvtgs.outofcore import simplify_file
+from cvtgs.outofcore.scan import read_sample
 from scenes import random_scene, same_bits
 
 BOX = Box(min=(-1e9, -1e9, 0.6), max=(1e9, 1e9, 1e9))
@@ -115,3 +117,27 @@ def test_scenes_far_from_the_origin_cause_a_warning(tmp_path):
     far = scene.with_tensors({"means": scene.means + 3e6}, {})
     with pytest.warns(UserWarning, match="float32 only resolves steps of 0.25"):
         in_blocks(tmp_path, far)
+
+
+def test_a_ratio_of_one_changes_no_row(scene, tmp_path):
+    """Neither quaternions of another length, nor opacities that merged Gaussians do not get."""
+    logits = scene.logit_opacities.clamp(min=18.0)
+    scene = scene.with_tensors(quats=scene.quats * 3, logit_opacities=logits)
+    cvtgs.save(scene, tmp_path / "in.ply")
+    simplify_file(tmp_path / "in.ply", tmp_path / "out.ply", 1.0, blocks=3)
+    found, wanted = cvtgs.load(tmp_path / "out.ply"), cvtgs.load(tmp_path / "in.ply")
+    rows = [torch.argsort(each.means[:, 0]) for each in (found, wanted)]
+    assert same_bits(found.select(rows[0]), wanted.select(rows[1]))
+
+
+@pytest.mark.parametrize("period", [2, 3, 4, 8])
+def test_a_sample_of_rows_in_a_periodic_order_is_balanced(tmp_path, period):
+    scene = random_scene(40_000, degree=0)
+    phases = (torch.arange(len(scene)) % period).float()
+    means = torch.stack([phases, phases, phases], dim=1)
+    cvtgs.save(scene.with_tensors(means=means), tmp_path / "in.ply")
+    for step in (1, 2, 4, 7, 16):
+        sample = read_sample(open_rows(tmp_path / "in.ply"), len(scene) // step)
+        assert len(sample) == -(-len(scene) // step)
+        shares = torch.bincount(sample.means[:, 0].long()) / len(sample)
+        assert float(shares.amin()) > 0.85 / period

@@ -52,6 +52,7 @@ def test_relative_paths_start_at_the_file(tmp_path):
     text = 'start = "first.safetensors"\n[data]\nfolders = ["scenes", "../more", "/far/away"]'
     config = from_text(tmp_path, text)
     assert config.start == tmp_path / "first.safetensors"
+    assert from_text(tmp_path, 'start = "standard"').start == Path("standard")
     assert config.data.folders == (tmp_path / "scenes", tmp_path / "../more", Path("/far/away"))
 
 

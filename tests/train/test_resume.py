@@ -149,6 +149,8 @@ def test_resuming_a_finished_run_changes_nothing(scenes, cache, tmp_path):
     again = run(config_of(scenes), path, cache, resume=True, on_validation=calls.append)
     assert repr(again.validations) == repr(first.validations)
     assert calls == []
+    TrainFiles.beside(path).curves.unlink()
+    run(config_of(scenes), path, cache, resume=True)  # draws them again
     assert {entry: entry.read_bytes() for entry in tmp_path.iterdir() if entry.is_file()} == files
 
 
@@ -222,3 +224,14 @@ def test_the_curves_cover_the_whole_training(scenes, cache, tmp_path):
         run(config, cut, cache, listener=interrupting(5))
     run(config, cut, cache, resume=True)
     assert_same_files(cut, whole)
+
+
+@pytest.mark.usefixtures("_quick_curves")
+@pytest.mark.slow
+def test_the_checkpoint_of_another_training_is_refused(scenes, cache, tmp_path):
+    path = tmp_path / "net.safetensors"
+    run(config_of(scenes), path, cache)
+    run(config_of(scenes, seed=5), tmp_path / "other.safetensors", cache)
+    path.write_bytes((tmp_path / "other.safetensors").read_bytes())
+    with pytest.raises(CheckpointError, match="other scenes or with another seed than"):
+        run(config_of(scenes), path, cache, resume=True)

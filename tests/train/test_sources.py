@@ -266,3 +266,12 @@ def test_perturbing_changes_places_shapes_colours_and_opacities():
     assert growth[0].item() == pytest.approx(thinned ** (2 / 3), rel=0.1)
     mix = torch.linalg.lstsq(before.sh0[:, 0], other.sh0[:, 0]).solution
     torch.testing.assert_close(other.sh, before.sh @ mix, rtol=1e-3, atol=1e-3)
+
+
+def test_a_file_that_is_too_large_to_be_used_is_named(tmp_path):
+    write_scenes(tmp_path, ["a", "exam"], 50)
+    cvtgs.save(random_scene(200, degree=0), tmp_path / "large.ply")
+    config = tiny_data(tmp_path, largest_scene=100)
+    with pytest.warns(UserWarning, match=r"large\.ply: not used for training, since 200 Gaussians"):
+        sources = find_sources(config, seed=0)
+    assert names_of(sources, is_validation=False) == ["a"]

@@ -15,7 +15,7 @@ from cvtgs.clock import check_listener
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import real_number, target_count
 from cvtgs.errors import GoalError, InvalidArgumentError
-from cvtgs.evaluation.scorer import MOST_PSNR, Metrics, Scorer, scene_scores
+from cvtgs.evaluation.scorer import MOST_PSNR, Metrics, Scorer, check_seen, scene_scores
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import Simplified, SimplifyReport
 from cvtgs.scene import GaussianScene, SceneLike
@@ -217,6 +217,7 @@ def heldout_scorer(full: GaussianScene, cameras: Cameras, *, listener: ProgressL
     total = len(cameras)
     if total == 0:
         raise InvalidArgumentError("heldout must hold at least one camera, found none.")
+    check_seen(full, cameras, name="the scene")
     return Scorer(
         full,
         cameras.singles(),

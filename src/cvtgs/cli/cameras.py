@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.display import say
-from cvtgs.cli.options import add_options
+from cvtgs.cli.options import add_options, read_axes
 from cvtgs.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -119,7 +119,8 @@ def choose_cameras(
             return cvtgs.evaluation.fit_cameras(cameras, images)
         return cameras if options.size is None else cameras.fitted(size)
     path = options.reference if "reference" in options else options.input
-    own = cvtgs.views.find_own_cameras(scene, path)
+    is_turned = read_axes(getattr(options, "axes", None)).source is not None
+    own = None if is_turned else cvtgs.views.find_own_cameras(scene, path)
     if own is not None:
         test = own.test_cameras() if held_out else None
         if not options.quiet:

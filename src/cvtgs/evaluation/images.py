@@ -27,7 +27,13 @@ Encoding = Literal["png", "webp"]
 
 ERROR_SCALE = 0.3  # difference from which on the brightest colour is used
 
+_PIXEL_ASPECT = 0.02  # difference of the focal lengths of a camera that may be its own
+
 # Ten steps of "magma" (van der Walt and Smith 2015, CC0), which is perceptually uniform.
+_PIXEL_ASPECT = (
+    0.02  # largest difference of the two focal lengths of a camera that counts as its own
+)
+
 _MAGMA = (
     (0, 0, 4),
     (24, 15, 62),
@@ -243,7 +249,10 @@ def fit_cameras(cameras: Cameras, folder: str | os.PathLike[str]) -> Cameras:
     for path, (wide, high), stretch in zip(paths, sizes, stretches, strict=True):
         # The tolerance allows for sizes that were rounded when the photographs were scaled.
         tolerance = 1.5 * max(cameras.width, cameras.height) * max(1.0, stretch)
-        errors = [abs(wide * cameras.height - high * cameras.width * x) for x in (1.0, stretch)]
+        wanted = wide * cameras.height
+        errors = [abs(wanted - high * cameras.width * x) for x in (1.0, stretch)]
+        if abs(stretch - 1) > _PIXEL_ASPECT:  # of which the camera's own pixels may have a part
+            errors[1] -= _PIXEL_ASPECT * wanted
         if min(errors) > tolerance:
             raise InvalidArgumentError(
                 f"{path}: photographs must have the aspect ratio of the cameras' images, "

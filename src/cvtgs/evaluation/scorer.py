@@ -14,6 +14,7 @@ from cvtgs.config.base import Record
 from cvtgs.errors import CvtgsError, InvalidArgumentError
 from cvtgs.evaluation.lpips import LEAST_PIXELS, LpipsNetwork, LpipsWeights, load_lpips, lpips
 from cvtgs.evaluation.metrics import alpha_bias, alpha_error, pair_psnr, ssim
+from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.rendering import BackendName, render
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
@@ -243,7 +244,7 @@ def check_seen(
     scene: GaussianScene, cameras: Cameras, *, name: str, backend: BackendName = "auto"
 ) -> None:
     """Raise if no camera sees anything of a scene."""
-    if cameras.shows_any(scene.means):
+    if cameras.shows_any(scene.means[scene.opacities >= MIN_ALPHA]):
         return
     images = (render_views(scene, camera, backend=backend) for camera in cameras.singles())
     if not any(float(image.alpha.mean()) >= LEAST_COVER for image in images):

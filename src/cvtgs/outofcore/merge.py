@@ -114,7 +114,10 @@ def correct(job: Job, block: int) -> None:
         )
     tensors = {name: values[: len(own["sizes"])] for name, values in small.tensors().items()}
     small = scene.with_tensors(tensors, under_prefix(EXTRA, own))
-    small = restore_columns(validity.standardized(small), original, job.read_scan().plan)
+    scan = job.read_scan()
+    is_whole = job.read_manifest().total == scan.row_count
+    finish = validity.with_finite_opacities if is_whole else validity.standardized
+    small = restore_columns(finish(small), original, scan.plan)
     report = BlockReport(
         input_count=len(scene),
         mass_out=float(small.masses.sum()),

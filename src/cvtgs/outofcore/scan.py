@@ -9,9 +9,11 @@ from operator import add
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
+import numpy as np
 import pydantic
 import torch
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs import analysis, cells, cvt, filters, validity
@@ -112,6 +114,7 @@ def _weighted_quantile(coordinates: Tensor, weights: Tensor, share: float) -> fl
 
 SAMPLE_ROWS = 1 << 18  # size of the sample from which frame, effect plan and partition are computed
 CHUNK = 1 << 15  # number of rows that are read together
+_GOLDEN = 0.6180339887498949  # multiples of it are spread evenly between whole numbers
 MAPPED_ROWS = 1 << 15  # number of rows of the file that are mapped together while a sample is read
 
 
@@ -170,12 +173,24 @@ class SceneScan:
 
 
 def read_sample(source: PlyRows, count: int) -> GaussianScene:
-    """Read about ``count`` Gaussians at equal steps over the file; return the valid ones."""
+    """Read one of every k Gaussians, about ``count``; return the valid ones.
+
+    Which of the k differs, so that a sample of rows in a periodic order is not one-sided.
+    """
     step = max(1, source.count // count)
     rows = step * max(1, MAPPED_ROWS // step)
     starts = range(0, source.count, rows)
-    parts = (source.read(start, min(start + rows, source.count), step) for start in starts)
+    ends = (min(start + rows, source.count) for start in starts)
+    parts = (_one_of(source.read(*span), step) for span in zip(starts, ends, strict=True))
     return validity.valid_part(source.assemble(parts, -(-source.count // step)))
+
+
+def _one_of(rows: NDArray[Any], step: int) -> NDArray[Any]:
+    """Return one of every ``step`` rows, each at another place."""
+    firsts = np.arange(0, len(rows), step)
+    places = np.floor(np.arange(len(firsts)) * _GOLDEN % 1 * step).astype(np.int64)
+    found: NDArray[Any] = rows[np.minimum(firsts + places, len(rows) - 1)]
+    return found
 
 
 @one_thread()

@@ -7,6 +7,7 @@ import pydantic
 
 from cvtgs.config import Section, explain, read_toml
 from cvtgs.errors import ConfigError
+from cvtgs.mergenet import SHIPPED
 
 Ratio = Annotated[float, pydantic.Field(gt=0.0, lt=1.0)]
 Count = Annotated[int, pydantic.Field(ge=1)]
@@ -187,6 +188,8 @@ class TrainConfig(Section):
         except pydantic.ValidationError as error:
             raise ConfigError(f"{path}: {explain(error)}") from None
         folders = tuple(path.parent / folder for folder in config.data.folders)
-        start = None if config.start is None else path.parent / config.start
+        start = config.start
+        if start is not None and str(start) not in SHIPPED:
+            start = path.parent / start
         data = config.data.model_copy(update={"folders": folders})
         return config.model_copy(update={"data": data, "start": start})

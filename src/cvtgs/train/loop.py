@@ -350,6 +350,10 @@ def _validate(
     if config.keep == "last" or history.since_best() == 0:
         _write_checkpoint(state, config, files)
     state.save(files.state, config)
+    _draw_curves(history, files)
+
+
+def _draw_curves(history: History, files: TrainFiles) -> None:
     try:
         curves = history.curves()
     except MissingDependencyError:
@@ -358,8 +362,17 @@ def _validate(
 
 
 def _restore_checkpoint(state: TrainState, config: TrainConfig, files: TrainFiles) -> None:
-    """Write a missing checkpoint again; raise if its network is not that of the state."""
+    """Write a missing checkpoint or image again; raise if the state is of another network."""
+    if state.history.validations and not files.curves.is_file():
+        _draw_curves(state.history, files)
     if files.checkpoint.is_file():
+        info = load_checkpoint(files.checkpoint).info
+        if (info.scenes, info.seed) != (state.scenes, config.seed):
+            raise CheckpointError(
+                f"{files.checkpoint}: the network is of a training run on other scenes or with "
+                f"another seed than {files.state}; restore or remove the file, or train to "
+                f"another output."
+            )
         return
     if config.keep == "best" and state.history.since_best() > 0:
         raise CheckpointError(

@@ -17,7 +17,7 @@ from cvtgs import synthetic
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Descriptors, Partition
 from cvtgs.config import SimplifyConfig
-from cvtgs.errors import ConfigError
+from cvtgs.errors import ConfigError, warn
 from cvtgs.evaluation.scorer import ViewImages
 from cvtgs.io import load
 from cvtgs.io.files import is_folder
@@ -120,6 +120,11 @@ def _from_files(
             )
             originals.append(block)
             yield block
+        if not originals:
+            warn(
+                f"{path}: not used for training, since {count:,} Gaussians are above "
+                f"data.largest_scene, {config.largest_scene:,}, and no blocks are cut from it."
+            )
         yield from _copies(originals, config.copies, seed)
 
 

@@ -252,7 +252,8 @@ def palette(rows: Float[np.ndarray, "n d"], most: int | None = None) -> Palette:
     if len(rows) <= most:
         return Palette(rows, np.arange(len(rows)))
     some = rows[:: 1 + len(rows) // _KNOTS]
-    middle = np.median(some, axis=0)  # centred, so that squares lose no digits
+    # Centred, so that squares lose no digits. The mean of two large float32 values can overflow.
+    middle = np.median(some.astype(np.float64), axis=0).astype(rows.dtype)
     with np.errstate(over="ignore"):
         away = np.clip(rows - middle, -_LARGEST_SHIFTED, _LARGEST_SHIFTED)
     shifted = torch.from_numpy(away)
