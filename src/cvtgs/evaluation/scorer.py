@@ -244,7 +244,8 @@ def check_seen(
     scene: GaussianScene, cameras: Cameras, *, name: str, backend: BackendName = "auto"
 ) -> None:
     """Raise if no camera sees anything of a scene."""
-    if cameras.shows_any(scene.means[scene.opacities >= MIN_ALPHA]):
+    is_drawn = scene.opacities >= MIN_ALPHA
+    if cameras.shows_any(scene.means[is_drawn] if bool(is_drawn.any()) else scene.means):
         return
     images = (render_views(scene, camera, backend=backend) for camera in cameras.singles())
     if not any(float(image.alpha.mean()) >= LEAST_COVER for image in images):
