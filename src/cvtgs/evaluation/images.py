@@ -30,10 +30,6 @@ ERROR_SCALE = 0.3  # difference from which on the brightest colour is used
 _PIXEL_ASPECT = 0.02  # difference of the focal lengths of a camera that may be its own
 
 # Ten steps of "magma" (van der Walt and Smith 2015, CC0), which is perceptually uniform.
-_PIXEL_ASPECT = (
-    0.02  # largest difference of the two focal lengths of a camera that counts as its own
-)
-
 _MAGMA = (
     (0, 0, 4),
     (24, 15, 62),
