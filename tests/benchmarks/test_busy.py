@@ -22,7 +22,7 @@ def test_loops_run_only_meanwhile():
     assert loops_now() == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_operation_is_measured(tmp_path, monkeypatch):
     cvtgs.save(demo_scene(500, seed=0), tmp_path / "scene.ply")
     monkeypatch.setattr(busy, "warm_up", lambda: None)

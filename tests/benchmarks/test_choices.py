@@ -32,6 +32,7 @@ def file(tmp_path):
     return tmp_path / "thing.ply"
 
 
+@pytest.mark.long
 def test_rows_have_the_scores_of_evaluate_and_differences_to_the_base(file, tmp_path, capsys):
     place = tmp_path / "rows.json"
     common = ["--base", "merge.network=false", "--rho", "0.1", "--cache", str(tmp_path / "kept")]
@@ -54,6 +55,7 @@ def test_rows_have_the_scores_of_evaluate_and_differences_to_the_base(file, tmp_
     assert float(last[3]) == pytest.approx(other["psnr"] - base["psnr"], abs=0.006)
 
 
+@pytest.mark.long
 def test_presets_can_be_fitted_to_cameras_that_do_not_score(file, tmp_path):
     place = tmp_path / "rows.json"
     small = ["visibility.size=32", "visibility.stride=1", "visibility.views=4", "refine.steps=0"]
@@ -72,6 +74,7 @@ def test_presets_can_be_fitted_to_cameras_that_do_not_score(file, tmp_path):
     assert row["psnr"] == pytest.approx(scores.psnr.mean, abs=1e-3)
 
 
+@pytest.mark.long
 def test_a_checkpoint_is_a_choice(file, tmp_path):
     place = tmp_path / "rows.json"
     common = ["--rho", "0.1", "--cache", str(tmp_path / "kept"), "--json", str(place)]
@@ -81,6 +84,7 @@ def test_a_checkpoint_is_a_choice(file, tmp_path):
     assert none == without != base == shipped
 
 
+@pytest.mark.long
 def test_images_may_ignore_the_tag(tmp_path, file):
     """The images of the full scene, too, also if those with the tag are cached."""
     tagged = replace(SCENE, comments=(ANTIALIASED.text,))

@@ -247,7 +247,7 @@ def test_keep_needs_a_size():
         check_goals(options("--target-psnr", "30", "--keep", "box.json"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_several_scenes_measure_the_machine_once(source, tmp_path, measured):
     shutil.copy(source, tmp_path / "other.ply")
     words = ["--rho", "0.1", "--time-budget", "50s", "--recalibrate", "--quiet"]
