@@ -24,7 +24,7 @@ from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES, checked_axes
 from cvtgs.io.locks import output_lock
-from cvtgs.io.ply import PlyRows, join_plys, open_rows
+from cvtgs.io.ply import join_plys, open_rows
 from cvtgs.outofcore.allocate import allocate, join
 from cvtgs.outofcore.images import (
     add_contributions,
@@ -45,7 +45,7 @@ from cvtgs.outofcore.memory import (
 )
 from cvtgs.outofcore.merge import correct, inflate, merge, read_report, simplify_block
 from cvtgs.outofcore.rows import kept_rows
-from cvtgs.outofcore.scan import CHUNK
+from cvtgs.outofcore.scan import CHUNK, read_sample
 from cvtgs.outofcore.sort import sort_into_blocks
 from cvtgs.prepared import check_cameras
 from cvtgs.processes import Result, Workers, with_progress
@@ -153,9 +153,9 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     if simplifier.config.uses_images:
         room -= IMAGE_BYTES
         if cameras is not None:
-            check_seen(_sampled(rows), cameras, name="the scene")
+            check_seen(read_sample(rows, SAMPLED), cameras, name="the scene")
         elif source_axes is None:
-            own = find_own_cameras(_sampled(rows), source)
+            own = find_own_cameras(read_sample(rows, SAMPLED), source)
             cameras = None if own is None else own.cameras
     merging = finer_count(target, rows.count, simplifier.config.allocation)
     job = Job(
@@ -188,11 +188,6 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         report = report_blocks(job, simplifier, clock, energies=energies, resumed=resumed)
         shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
     return report
-
-
-def _sampled(rows: PlyRows) -> GaussianScene:
-    """Read a few Gaussians of a file, evenly spaced."""
-    return rows.scene(rows.read(0, rows.count, max(1, rows.count // SAMPLED)))
 
 
 def rows_per_range(count: int) -> int:

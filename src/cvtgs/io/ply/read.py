@@ -303,11 +303,10 @@ class PlyRows:
         """The type of a row."""
         return np.dtype(list(self.names))
 
-    def read(self, start: int, stop: int, step: int = 1) -> NDArray[Any]:
-        """Map every ``step``-th row of a range into memory; pages are read on use."""
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Map a range of rows into memory; pages are read on use."""
         place = self.offset + start * self.dtype.itemsize
-        rows = np.memmap(self.path, self.dtype, "r", place, (stop - start,)).view(np.ndarray)
-        return rows[::step]
+        return np.memmap(self.path, self.dtype, "r", place, (stop - start,)).view(np.ndarray)
 
     def scene(self, rows: NDArray[Any]) -> GaussianScene:
         """Build a scene from rows with at least the columns of the file, as a load returns it."""
