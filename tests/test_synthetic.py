@@ -1,6 +1,7 @@
 """Generated scenes: exact, repeatable, varied, and similar to trained scenes."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -208,3 +209,16 @@ def test_autocast_does_not_change_scenes():
     with torch.autocast("cpu", dtype=torch.bfloat16):
         found = synthetic.scene("courtyard", 500, seed=3)
     assert same_bits(found, wanted)
+
+
+def test_threads_make_the_same_scenes_whatever_the_default_dtype():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            found = list(pool.map(lambda _: synthetic.scene("object", 500, seed=1), range(24)))
+        assert torch.get_default_dtype() == torch.float64
+    finally:
+        torch.set_default_dtype(before)
+    wanted = synthetic.scene("object", 500, seed=1)
+    assert all(same_bits(one, wanted) for one in found)

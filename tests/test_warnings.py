@@ -1,15 +1,21 @@
 """Warnings point at the line of the program that called cvtgs, whichever function it called."""
 
+import gc
+import sys
 import warnings
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import plyfile
 import pytest
 import torch
 
 import cvtgs
 from cvtgs.cameras import Cameras
-from cvtgs.errors import DroppedDataWarning
+from cvtgs.errors import DroppedDataWarning, warn, without_warnings
 from cvtgs.levels import write_levels
 from cvtgs.scene import GaussianScene
 from cvtgs.synthetic import scene as make
@@ -82,3 +88,57 @@ def test_every_line_of_a_program_is_warned_once(tmp_path: Path) -> None:
             scene.save(tmp_path / "a.splat", overwrite=number > 0)
         scene.save(tmp_path / "a.splat", overwrite=True)
     assert len(caught) == 2
+
+
+READINGS = (".ply", ".sog", ".pt")
+
+
+def write_as(suffix: str, scene: GaussianScene, folder: Path) -> Path:
+    """Write a scene as text, as images, or as a checkpoint with a number of numpy."""
+    path = folder / f"scene{suffix}"
+    if suffix == ".pt":
+        torch.save({"splats": cvtgs.to_dict(scene), "rate": np.float64(0.1)}, path)
+        return path
+    scene.save(path)
+    if suffix == ".ply":
+        text = plyfile.PlyData.read(path, mmap=False)
+        text.text = True
+        text.write(path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", READINGS)
+def test_reading_leaves_the_filters_of_the_process_alone(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Threads that change the filters at once leave them changed, with all warnings ignored."""
+    path, true = write_as(suffix, make("object", 300), tmp_path), warnings.catch_warnings
+
+    def watched(*args: Any, **values: Any) -> Any:
+        caller = sys._getframe(1).f_globals["__name__"]
+        assert not caller.startswith("cvtgs"), caller
+        return true(*args, **values)
+
+    monkeypatch.setattr(warnings, "catch_warnings", watched)
+    assert len(cvtgs.load(path)) == 300
+
+
+def test_reading_text_closes_its_file(tmp_path: Path) -> None:
+    path = write_as(".ply", make("object", 30), tmp_path)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        cvtgs.load(path)
+        gc.collect()
+    assert not caught
+
+
+def test_left_out_warnings_are_those_of_a_category_in_one_thread() -> None:
+    with warnings.catch_warnings(record=True) as caught, ThreadPoolExecutor(1) as pool:
+        warnings.simplefilter("always")
+        with without_warnings(DroppedDataWarning):
+            warn("dropped", DroppedDataWarning)
+            warn("something else")
+            pool.submit(warn, "of another thread", DroppedDataWarning).result()
+        warn("later", DroppedDataWarning)
+    found = [str(one.message) for one in caught]
+    assert found == ["something else", "of another thread", "later"]

@@ -44,6 +44,8 @@ _NO_MEMORY = re.compile(
 RENAMINGS: ContextVar[tuple[Callable[[str], str], ...]] = ContextVar("RENAMINGS", default=())
 """What replaces the names of temporary files in warnings, while streams are read."""
 
+_LEFT_OUT: ContextVar[tuple[type[Warning], ...]] = ContextVar("_LEFT_OUT", default=())
+
 
 class CvtgsError(Exception):
     """Base of every error that cvtgs raises on purpose; its text is one clear sentence."""
@@ -146,12 +148,28 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
 
     Lines of cvtgs are skipped, and those between them: decorators of torch and of contextlib.
     """
+    if issubclass(category, _LEFT_OUT.get()):
+        return
     for rename in RENAMINGS.get():
         text = rename(text)
     level, frame, skipped = 1, sys._getframe(), {"cvtgs", "contextlib", "torch"}
     while frame.f_back and str(frame.f_globals.get("__name__")).partition(".")[0] in skipped:
         level, frame = level + 1, frame.f_back
     warnings.warn(text, category, stacklevel=level)
+
+
+@contextmanager
+def without_warnings(category: type[Warning] = Warning) -> Iterator[None]:
+    """Issue no warnings of cvtgs of a category in this thread.
+
+    ``warnings.catch_warnings`` changes the filters of the whole process, and leaves them changed if
+    several threads use it at once.
+    """
+    token = _LEFT_OUT.set((category,))
+    try:
+        yield
+    finally:
+        _LEFT_OUT.reset(token)
 
 
 def reason_of(error: Exception) -> str:

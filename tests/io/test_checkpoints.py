@@ -1,5 +1,6 @@
 """Checkpoints of nerfstudio and gsplat."""
 
+import math
 import pickle
 import random
 import warnings
@@ -86,6 +87,26 @@ def test_reading_leaves_torch_safe_globals_unchanged(tmp_path: Path) -> None:
     assert set(torch.serialization.get_safe_globals()) == before
 
 
+def test_names_that_the_program_declares_safe_meanwhile_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, true = torch.serialization.get_safe_globals(), torch.load
+
+    def reading(*args: Any, **values: Any) -> Any:
+        assert "scalar" in {item.__name__ for item in torch.serialization.get_safe_globals()}
+        torch.serialization.add_safe_globals([random.Random])
+        return true(*args, **values)
+
+    monkeypatch.setattr(torch, "load", reading)
+    torch.save(splatfacto(random_scene(2)), tmp_path / "a.ckpt")
+    try:
+        load(tmp_path / "a.ckpt")
+        assert set(torch.serialization.get_safe_globals()) == {*before, random.Random}
+    finally:
+        torch.serialization.clear_safe_globals()
+        torch.serialization.add_safe_globals(before)
+
+
 class Evil:
     def __reduce__(self) -> tuple[Any, ...]:
         return (Path.touch, (Path("evil"),))
@@ -100,6 +121,38 @@ def test_code_in_a_checkpoint_is_not_executed(
     with pytest.raises(FileFormatError, match="must be an intact checkpoint of tensors and plain"):
         load(path)
     assert not (tmp_path / "evil").exists()
+
+
+class Storage:
+    """A storage that the file does not hold: reading makes one of memory as it is."""
+
+    def __init__(self, kind: type, count: int) -> None:
+        self.kind, self.count = kind, count
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self.kind, (self.count,)
+
+
+class Unstored:
+    """A tensor of such a storage."""
+
+    def __init__(self, kind: type, tensor: Tensor) -> None:
+        self.kind, self.shape, self.strides = kind, tuple(tensor.shape), tensor.stride()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        storage = Storage(self.kind, math.prod(self.shape))
+        more = storage, 0, self.shape, self.strides, False, OrderedDict()
+        return torch._utils._rebuild_tensor_v2, more
+
+
+@pytest.mark.parametrize("kind", [torch.storage.TypedStorage, torch.storage.UntypedStorage])
+def test_tensors_that_are_not_in_the_file_are_refused(tmp_path: Path, kind: type) -> None:
+    """Otherwise a scene would show what the process had in its memory before."""
+    path = tmp_path / "a.pt"
+    state = {name: Unstored(kind, values) for name, values in to_dict(random_scene(100)).items()}
+    torch.save({"splats": state}, path)
+    with pytest.raises(FileFormatError, match=f"numbers, found 'torch.storage.{kind.__name__}'"):
+        load(path)
 
 
 def test_checkpoints_without_a_whole_scene_are_refused(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 import argparse
 import sys
 import time
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import cvtgs
 from cvtgs.cli.display import say
-from cvtgs.errors import DroppedDataWarning, GoalError, InvalidArgumentError
+from cvtgs.errors import DroppedDataWarning, GoalError, InvalidArgumentError, without_warnings
 
 if TYPE_CHECKING:
     from cvtgs.budget import Found
@@ -127,8 +126,7 @@ def search_target(
         """Write a scene to a temporary file of the format of OUT, and read it again."""
         with TemporaryDirectory() as folder:
             file = Path(folder) / options.output.name
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DroppedDataWarning)  # the output file warns
+            with without_warnings(DroppedDataWarning):  # the output file warns
                 cvtgs.io.save(small, file, axes=axes)
             return cvtgs.io.load(file, device=small.device, axes=axes, trust_sizes=True)
 

@@ -3,10 +3,10 @@
 import codecs
 import pickletools
 import re
-import warnings
+import threading
 import zipfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -50,10 +50,22 @@ _NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN", "features_dc", 
 _ALLOWED = re.compile(
     r"collections\.(OrderedDict|defaultdict)|torch\._utils\._rebuild_(tensor(_v2)?|parameter)|"
     r"torch\.(\w+Storage|Size|device|u?int\d+|b?float\d+(_\w+)?|bool|nn\.parameter\.Parameter)|"
-    r"torch\.storage\.\w+Storage|numpy(\._?core\.multiarray\.scalar|\.dtype)|_codecs\.encode|"
+    r"numpy(\._?core\.multiarray\.scalar|\.dtype)|_codecs\.encode|"
     r"(builtins|__builtin__)\.(dict|list|set|tuple|int|float|complex)"
 )
-"""Names that a checkpoint may refer to: those that tensors and numbers need."""
+"""Names that a checkpoint may refer to: those that tensors and numbers need.
+
+``torch.FloatStorage`` and the like only name a type, but the classes in ``torch.storage`` can be
+called: such a tensor would show what the process had in its memory before.
+"""
+
+_NUMPY_NAMES = {
+    "numpy.dtype",
+    "numpy.core.multiarray.scalar",  # numpy 1
+    "numpy._core.multiarray.scalar",
+    "_codecs.encode",
+}
+_STAND_INS = threading.Lock()  # held while stand-ins for these are among torch's safe names
 
 _BYTE_CODECS = re.compile(r"(?i)(hex|base.?64|quopri|quoted.?printable|uu|bz2|zlib|zip)(.?codec)?")
 _PREFIXES = ("", "_model.gauss_params.", "_model.", "module._model.gauss_params.")
@@ -314,20 +326,22 @@ def _unpickled(path: Path) -> Any:
                 f"{path}: must be a checkpoint in the zip format of torch.save, "
                 f"found another format."
             )
+    names = set[str]()
     for name in _names_in(path):
         if not _ALLOWED.fullmatch(name):
             raise FileFormatError(
                 f"{path}: must be an intact checkpoint of tensors and plain numbers, "
                 f"found {shown(name)}."
             )
-    with _numpy_numbers_ignored(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # from torch, about content that it then refuses
+        names.add(name)
+    with _numpy_numbers_ignored() if names & _NUMPY_NAMES else nullcontext():
         return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
 
 
 def _names_in(path: Path) -> Iterator[str]:
-    """Yield the names in the pickles of a checkpoint, codecs from bytes to bytes, and zip faults.
+    """Yield the names in the pickles of a checkpoint, and what `torch.save` never writes.
 
+    That is codecs from bytes to bytes, other protocols, of which torch warns, and compression.
     ``weights_only`` blocks code, but allows ``bytearray`` and other names that take any memory.
     """
     with zipfile.ZipFile(path) as archive:
@@ -342,6 +356,8 @@ def _names_in(path: Path) -> Iterator[str]:
                 for operation, value, _ in pickletools.genops(archive.read(entry)):
                     if operation.name in ("GLOBAL", "INST"):
                         yield str(value).replace(" ", ".")
+                    elif operation.name == "PROTO" and value != 2:
+                        yield f"protocol {value}"
                     elif isinstance(value, str) and _BYTE_CODECS.fullmatch(value):
                         yield value
 
@@ -360,16 +376,19 @@ class _IgnoredType:
 def _numpy_numbers_ignored() -> Iterator[None]:
     """Let torch's restricted unpickler ignore numpy scalars (learning rates of schedulers).
 
-    It would refuse them. Stand-ins with the same names take their place.
+    It would refuse them. Stand-ins with the same names take their place, in the whole process: only
+    one file is read so at a time, and names that the program adds meanwhile stay.
     """
-    names = [("numpy", "dtype")]
-    names += [(f"numpy.{core}.multiarray", "scalar") for core in ("core", "_core")]  # numpy 1 and 2
     stand_ins: list[Any] = [codecs.encode]  # torch 2.6 and later allows it anyway
-    stand_ins += [type(name, (_IgnoredType,), {"__module__": module}) for module, name in names]
-    before = list(torch.serialization.get_safe_globals())
-    torch.serialization.add_safe_globals(stand_ins)
-    try:
-        yield
-    finally:
-        torch.serialization.clear_safe_globals()
-        torch.serialization.add_safe_globals(before)
+    for path in sorted(_NUMPY_NAMES - {"_codecs.encode"}):
+        module, _, name = path.rpartition(".")
+        stand_ins.append(type(name, (_IgnoredType,), {"__module__": module}))
+    with _STAND_INS:
+        own = [item for item in stand_ins if item not in torch.serialization.get_safe_globals()]
+        torch.serialization.add_safe_globals(own)
+        try:
+            yield
+        finally:
+            others = [item for item in torch.serialization.get_safe_globals() if item not in own]
+            torch.serialization.clear_safe_globals()
+            torch.serialization.add_safe_globals(others)

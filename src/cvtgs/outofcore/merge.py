@@ -1,6 +1,5 @@
 """Turn the cells of a block into Gaussians: merge, inflate, correct, with remote neighbours."""
 
-import warnings
 from typing import NamedTuple
 
 import torch
@@ -13,6 +12,7 @@ from cvtgs.analysis.effects import select_columns
 from cvtgs.clock import StageClock
 from cvtgs.cvt.nearest import search_name
 from cvtgs.devices import one_thread
+from cvtgs.errors import without_warnings
 from cvtgs.io import save
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.tensors import add_prefix, under_prefix
@@ -202,6 +202,5 @@ def write_block(
     path = job.improved_path(block) if is_improved else job.small_path(block)
     axes = job.axes if path == job.finished_path(block) else SCENE_AXES
     job.write_file(job.report_path(block).name, report.model_dump_json().encode())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with without_warnings():
         save(small, path, overwrite=True, axes=axes)

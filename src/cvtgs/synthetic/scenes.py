@@ -1,5 +1,6 @@
 """Generate a scene from a kind, a count and a seed, chunk by chunk."""
 
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -18,6 +19,7 @@ from cvtgs.text import shown
 
 KINDS = tuple(LAYOUTS)  # the kinds of scenes that can be made
 _CHUNK = 1 << 15  # rows that are drawn together; this many fit into the cache of one core
+_DEFAULT_DTYPE = threading.RLock()  # held while torch's default dtype is float32 for scenes
 
 
 def scene(kind: str, count: int, *, sh_degree: int = 3, seed: int = 0) -> GaussianScene:
@@ -93,14 +95,19 @@ def demo_scene(count: int = 200_000, *, sh_degree: int = 3, seed: int = 0) -> Ga
 
 @contextmanager
 def _settings() -> Iterator[None]:
-    """Set torch to float32, the CPU and one thread; chunks are too small for more."""
-    dtype = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float32)
-    try:
-        with one_thread(), torch.device("cpu"), without_autocast():
+    """Set torch to float32, the CPU and one thread; chunks are too small for more.
+
+    The default dtype is that of the whole process, so only one thread at a time may change it.
+    """
+    with _DEFAULT_DTYPE, one_thread(), torch.device("cpu"), without_autocast():
+        dtype = torch.get_default_dtype()
+        if dtype != torch.float32:
+            torch.set_default_dtype(torch.float32)
+        try:
             yield
-    finally:
-        torch.set_default_dtype(dtype)
+        finally:
+            if dtype != torch.float32:
+                torch.set_default_dtype(dtype)
 
 
 def _draw_parts(

@@ -4,6 +4,7 @@ import io
 import os
 import warnings
 from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -40,7 +41,7 @@ from cvtgs.io.ply.header import (
 )
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import FLAT_LOG_SCALE, NORMALS, GaussianScene
-from cvtgs.text import shown
+from cvtgs.text import first_of, shown
 
 CHUNK_BYTES = 1 << 20
 """Bytes of a file that are mapped at a time; a chunk and its copy fit into the L2 cache."""
@@ -65,7 +66,7 @@ def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -
         if can_map(header):
             chunks = _mapped_chunks(file, header)
         else:
-            rows = _parsed_rows(header, vertex, where)
+            rows = _parsed_rows(file, header, vertex, where)
             starts = range(0, vertex.count, _CHUNK_ROWS)
             chunks = (rows[start : start + _CHUNK_ROWS] for start in starts)
         scene = assemble(
@@ -93,8 +94,8 @@ def _warn_of_dropped(header: Header, vertex: Element, path: str) -> None:
     ]
     if dropped:
         warn(
-            f"{path}: left out {', '.join(dropped)}, since a scene holds one number per Gaussian "
-            f"and property.",
+            f"{path}: left out {first_of(dropped, length=120)}, since a scene holds one number "
+            f"per Gaussian and property.",
             DroppedDataWarning,
         )
 
@@ -192,7 +193,7 @@ def _mapped_chunks(file: BinaryIO, header: Header) -> Iterator[NDArray[Any]]:
         yield np.memmap(file, dtype, "r", offset, shape).view(np.ndarray)
 
 
-def _parsed_rows(header: Header, vertex: Element, path: str) -> NDArray[Any]:
+def _parsed_rows(file: BinaryIO, header: Header, vertex: Element, path: str) -> NDArray[Any]:
     """Read the vertex rows of any PLY file; ASCII rows and rows with lists are held in memory."""
     try:
         from plyfile import PlyData, PlyElementParseError, PlyParseError  # noqa: PLC0415
@@ -203,8 +204,7 @@ def _parsed_rows(header: Header, vertex: Element, path: str) -> NDArray[Any]:
         ) from error
     needed = header.elements[: header.elements.index(vertex) + 1]
     try:
-        with _CleanStream(path, header, needed) as stream, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # from numpy, about empty lists
+        with _CleanStream(file, header, needed) as stream, _no_warnings(header, needed):
             data = PlyData.read(stream)[f"e{len(needed) - 1}"].data
     except PlyElementParseError as error:
         raise FileFormatError(_explain(error, needed, path)) from error
@@ -216,6 +216,16 @@ def _parsed_rows(header: Header, vertex: Element, path: str) -> NDArray[Any]:
     rows: NDArray[Any] = data.view(np.ndarray)
     rows.dtype.names = tuple(prop.name for prop in vertex.properties)
     return rows
+
+
+def _no_warnings(header: Header, elements: tuple[Element, ...]) -> AbstractContextManager[object]:
+    """Ignore the warnings of numpy about empty lists, which only a text file with lists causes.
+
+    Elsewhere, the filters of warnings, which belong to the whole process, stay as they are.
+    """
+    has_lists = any(prop.count_type for element in elements for prop in element.properties)
+    is_text = header.encoding == "ascii"
+    return warnings.catch_warnings(action="ignore") if is_text and has_lists else nullcontext()
 
 
 def _plain_header(header: Header, elements: tuple[Element, ...]) -> bytes:
@@ -234,8 +244,8 @@ def _plain_header(header: Header, elements: tuple[Element, ...]) -> bytes:
 class _CleanStream(io.BufferedReader):
     """A PLY file with a replaced header; positions are those of the original file."""
 
-    def __init__(self, path: str, header: Header, elements: tuple[Element, ...]) -> None:
-        super().__init__(io.FileIO(path))
+    def __init__(self, file: BinaryIO, header: Header, elements: tuple[Element, ...]) -> None:
+        super().__init__(io.FileIO(file.fileno(), closefd=False))
         self._pending = io.BytesIO(_plain_header(header, elements))
         self._is_text = header.encoding == "ascii"
         self._size = self.seek(0, io.SEEK_END)

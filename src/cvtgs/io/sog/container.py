@@ -2,7 +2,6 @@
 
 import io
 import os
-import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -20,6 +19,8 @@ MOST_META_BYTES = 1 << 20  # largest size of ``meta.json``; real ones have about
 
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compression methods whose output zipfile bounds; it unpacks blocks of bzip2 or LZMA whole."""
+
+_PNG = b"\x89PNG\r\n\x1a\n"
 
 QUAT_TAG = 252  # the last byte of a rotation is this plus the number of its omitted component
 PALETTE_COLUMNS = 64  # entries of the SH palette per row of its image
@@ -117,21 +118,23 @@ def _too_long(where: str, most: int, found: int) -> FileFormatError:
 
 def decode_webp(content: bytes, where: str, *, most_pixels: int) -> UInt8[np.ndarray, "h w 4"]:
     """Decode an image that stores numbers in its channels."""
-    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 (loads in its time)
+    from PIL.PngImagePlugin import PngImageFile  # noqa: PLC0415 (loads in its time)
+    from PIL.WebPImagePlugin import WebPImageFile  # noqa: PLC0415
 
-    with _damage_named(f"{where} must be an intact image, found"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        try:
-            image = Image.open(io.BytesIO(content), formats=("WEBP", "PNG"))
-        except UnidentifiedImageError as error:
-            raise FileFormatError(f"{where} must be a WebP image, found something else.") from error
-        with image:
-            if image.width * image.height > most_pixels:
-                raise FileFormatError(
-                    f"{where} must have at most {most_pixels:,} pixels, "
-                    f"found {image.width} x {image.height}."
-                )
-            return np.asarray(image.convert("RGBA"))
+    is_webp = content.startswith(b"RIFF") and content[8:12] == b"WEBP"
+    if not is_webp and not content.startswith(_PNG):
+        raise FileFormatError(f"{where} must be a WebP image, found something else.")
+    kind = WebPImageFile if is_webp else PngImageFile  # `Image.open` would warn of large images
+    with (
+        _damage_named(f"{where} must be an intact image, found"),
+        kind(io.BytesIO(content)) as image,
+    ):
+        if image.width * image.height > most_pixels:
+            raise FileFormatError(
+                f"{where} must have at most {most_pixels:,} pixels, "
+                f"found {image.width} x {image.height}."
+            )
+        return np.asarray(image.convert("RGBA"))
 
 
 def encode_webp(numbers: UInt8[np.ndarray, "h w 4"]) -> bytes:
