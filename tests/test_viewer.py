@@ -33,6 +33,7 @@ def scene() -> GaussianScene:
 @pytest.fixture(autouse=True)
 def without_viser(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "viser", viser_stand_in)
+    monkeypatch.setitem(sys.modules, "websockets.asyncio.server", SimpleNamespace(serve=None))
 
 
 @pytest.fixture
@@ -154,22 +155,27 @@ def test_the_current_view_is_scored(page: Any) -> None:
 
 
 @pytest.mark.slow
-def test_the_shown_scene_is_saved(page: Any, tmp_path: Path) -> None:
-    path = tmp_path / "out.ply"
-    control(page, "file").value = str(path)
-    for said in (f"{path}: 50 Gaussians.", "must not exist yet, found a file"):
+def test_the_shown_scene_is_saved(
+    page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    control(page, "file").value = "out.ply"
+    for said in ("out.ply: 50 Gaussians.", "must not exist yet, found a file"):
         control(page, "save this scene").call()
         assert said in notes(page)
-    assert same_bits(load(path), page.viewer.scenes["simplified"].scene)
+    assert same_bits(load("out.ply"), page.viewer.scenes["simplified"].scene)
     control(page, "file").value = "  "
     control(page, "save this scene").call()
     assert notes(page) == "**a file name is needed to save a scene, found none.**"
 
 
 @pytest.mark.slow
-def test_markup_in_names_is_not_interpreted(page: Any, tmp_path: Path) -> None:
-    path = tmp_path / "*a* <iframe srcdoc='<img src=x onerror=f()>'> `b`.ply"
-    control(page, "file").value = str(path)
+def test_markup_in_names_is_not_interpreted(
+    page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = "*a* <iframe srcdoc='<img src=x onerror=f()>'> `b`.ply"
+    control(page, "file").value = path
     control(page, "save this scene").call()
     assert notes(page) == f"{path}: 50 Gaussians."
     assert not re.search(r"(?<!\\)[<>*`_]", control(page, NOTES).content)

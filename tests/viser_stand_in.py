@@ -43,7 +43,7 @@ class Gui:
 
     def add_slider(self, label, min, max, step, initial_value):
         assert min <= initial_value <= max
-        return self._add("slider", label, value=initial_value, step=step)
+        return self._add("slider", label, value=initial_value, step=step, min=min, max=max)
 
     def add_dropdown(self, label, options, *, initial_value):
         assert initial_value in options

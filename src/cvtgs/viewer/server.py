@@ -1,12 +1,11 @@
 """Serve a page with viser: the nodes of its scenes, the controls, and the simplification."""
 
-import io
 import math
 import re
-import socket
 import threading
+import traceback
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stdout, suppress
+from contextlib import suppress
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -14,20 +13,15 @@ import torch
 
 from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.counts import target_count
-from cvtgs.errors import (
-    CvtgsError,
-    InvalidArgumentError,
-    MissingDependencyError,
-    how_to_install,
-    memory_errors,
-    reason_of,
-)
+from cvtgs.errors import CvtgsError, OutputError, memory_errors
+from cvtgs.io.files import is_within
 from cvtgs.math.frames import robust_frame
 from cvtgs.math.parameters import build_covariances, normalize_quats
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
-from cvtgs.text import counted, printable, shortened
+from cvtgs.text import counted, printable, printable_name, shortened
 from cvtgs.validity import valid_part
+from cvtgs.viewer.connection import start_server, stop_server
 from cvtgs.viewer.scenes import FULL, SIMPLIFIED, SceneViewer, camera_of
 from cvtgs.views import automatic_views
 from cvtgs.views.layout import find_layout
@@ -35,7 +29,7 @@ from cvtgs.views.layout import find_layout
 if TYPE_CHECKING:
     import viser
 
-__all__ = ["ViewerServer", "check_viewer", "scene_page"]
+__all__ = ["ViewerServer", "scene_page"]
 
 Point = tuple[float, float, float]
 
@@ -104,7 +98,7 @@ class SceneNode:
     """A scene on a server, and a label with its name that is shown and hidden with it."""
 
     def __init__(self, server: "viser.ViserServer", name: str, path: str, *, label: Point) -> None:
-        self._server, self.name = server, printable(name)
+        self._server, self.name = server, printable_name(name)
         self._path, self._label = path, label
         self._splats: Any = None
 
@@ -167,47 +161,6 @@ def _three(point: torch.Tensor) -> Point:
     return x, y, z
 
 
-def start_server(host: str, port: int) -> "viser.ViserServer":
-    check_viewer()
-    import viser  # noqa: PLC0415 (optional)
-
-    _check_host(host)  # viser would wait for ever
-    with redirect_stdout(io.StringIO()):  # viser prints even if verbose is False
-        return viser.ViserServer(host=host, port=port, label="cvtgs", verbose=False)
-
-
-def _check_host(host: str) -> None:
-    """Raise unless this machine can listen on an address."""
-    try:
-        family, kind, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind) as probe:
-            probe.bind(address)
-    except (OSError, UnicodeError) as error:
-        raise InvalidArgumentError(
-            f"host must be an address or a name of this machine, found {host!r}: "
-            f"{reason_of(error)}."
-        ) from error
-
-
-def stop_server(server: "viser.ViserServer") -> None:
-    with redirect_stdout(io.StringIO()):
-        server.stop()
-
-
-def check_viewer() -> None:
-    """Check that pages can be served, before scenes are read.
-
-    Raises:
-        MissingDependencyError: viser is not installed.
-    """
-    try:
-        import viser  # noqa: F401, PLC0415 (optional)
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"the viewer needs the package viser; {how_to_install('cvtgs[view]')}."
-        ) from error
-
-
 class ViewerServer:
     """A viser server that shows the scenes, with a slider of rho, presets, scores and saving.
 
@@ -239,7 +192,7 @@ class ViewerServer:
         target_count(1, rho)
         self._viewer, self._wanted = viewer, threading.Event()
         self._start: float | None = rho
-        self._error: CvtgsError | None = None
+        self._error: Exception | None = None
         self._closed, self._first = False, threading.Event()
         self._server = start_server(host, port)
         self._label = look_at(self._server, viewer.scenes[FULL].scene)
@@ -328,7 +281,8 @@ class ViewerServer:
         self._wanted.set()
 
     def _simplify(self) -> str:
-        rho = self._start or min(1.0, 10.0**self._slider.value)
+        slider = self._slider  # another program may send any value
+        rho = self._start or 10.0 ** min(slider.max, max(slider.min, slider.value))
         self._facts.content = f"simplifying to {rho:.4g} ..."
         small = self._viewer.simplify(self._preset.value, rho)
         self._draw(SIMPLIFIED, small.scene)
@@ -363,15 +317,25 @@ class ViewerServer:
         return f"{name}: {self._viewer.score(name, cameras):.2f} dB in this view"
 
     def _save(self) -> str:
-        return self._viewer.save(self._shown.value, self._path.value.strip())
+        """Save the shown scene; with ``host``, others than the user of this machine may do so."""
+        name = self._path.value.strip()
+        if name and not is_within(name):
+            raise OutputError(
+                f"{name}: a scene is saved in the folder where the program was started, or below."
+            )
+        return self._viewer.save(self._shown.value, name)
 
-    def _try(self, action: Callable[[], str]) -> CvtgsError | None:
+    def _try(self, action: Callable[[], str]) -> Exception | None:
         """Run an action, and show its result or its error, which is returned, on the page."""
         try:
             with memory_errors("this", _ADVICE):
                 self._notes.content = plain(action())
         except CvtgsError as error:
             self._notes.content = f"**{plain(str(error))}**"
+            return error
+        except Exception as error:  # such as for a value that only another program would send
+            traceback.print_exc()
+            self._notes.content = f"**unexpected error ({type(error).__name__}): see the terminal**"
             return error
         return None
 
