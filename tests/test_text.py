@@ -11,7 +11,7 @@ import pytest
 
 import cvtgs
 from cvtgs.cli.main import main
-from cvtgs.text import columns, printable, shortened, shown, size_text
+from cvtgs.text import columns, first_of, printable, shortened, shown, size_text
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
 
 CLI = Path(cvtgs.__file__).parent / "cli"
@@ -160,3 +160,32 @@ def test_file_names_that_are_not_utf_8_work(tmp_path: Path) -> None:
     done = run("utf-8", "compare", path, str(levels / "rho_0.5.ply"), "-o", str(page), *words)
     assert (done.returncode, done.stderr) == (0, b"")
     assert r"sc\udce9ne" in (page / "index.html").read_text().replace("\\\\", "\\")
+
+
+def test_lists_of_a_file_are_cut_after_ten() -> None:
+    assert first_of(["a", "b"]) == "a, b"
+    assert first_of(["x" * 99, *"abcdefghijk"], length=9, between="; ") == (
+        "xxxxxx...; a; b; c; d; e; f; g; h; i; and 2 more"
+    )
+    assert first_of([]) == ""
+
+
+def test_long_lists_of_a_file_are_not_printed_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    properties = [*gaussian_properties(), *((f"{'x' * 50}{k}", "float") for k in range(500))]
+    comments = ["y" * 9000] * 50
+    path = tmp_path / "a.ply"
+    path.write_bytes(ply_bytes(properties, gaussian_rows(properties, 30), comments=comments))
+    for words in (["info", str(path)], ["convert", str(path), str(tmp_path / "b.spz")]):
+        assert main(words) == 0
+        assert len("".join(capsys.readouterr())) < 6000
+
+
+def test_a_line_feed_in_a_name_starts_no_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a\ncvtgs: error: b.ply"
+    path.write_bytes(b"no ply")
+    assert main(["info", str(path)]) == 1
+    assert capsys.readouterr().err.count("\n") == 1

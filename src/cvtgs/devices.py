@@ -73,10 +73,11 @@ def usable_device(device: str | torch.device) -> torch.device:
         torch.empty(0, device=resolved)
     except (RuntimeError, AssertionError, NotImplementedError, ImportError) as error:
         reason = shortened(re.split(r"\.?\n|\. |\.$", str(error))[0], 120)
+        others = "'cpu'"
         if reason.startswith("Expected one of"):  # all types that torch knows
-            reason = "torch has no such device"
+            reason, others = "torch has no such device", "'cpu' or 'cuda'"
         raise DeviceError(
-            f"device {str(device)!r} cannot be used here: {reason}; use another, such as 'cpu'."
+            f"device {str(device)!r} cannot be used here: {reason}; use another, such as {others}."
         ) from None
     return resolved
 

@@ -17,7 +17,7 @@ from cvtgs.io import check_output, check_save, load, save
 from cvtgs.io.atomic import make_folder, write_atomically
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.report import Level
-from cvtgs.text import counted, printable, shown
+from cvtgs.text import counted, printable_name, shown
 
 __all__ = ["LevelEntry", "LevelsIndex", "write_levels"]
 
@@ -192,7 +192,7 @@ def write_levels(
         save(level.scene, place / name, overwrite=overwrite, axes=axes)
         entries.append(_entry(level, rho, place / name))
     index = LevelsIndex(
-        source=printable(os.fspath(source)),
+        source=printable_name(os.fspath(source)),
         source_count=levels[0].report.input_count,
         levels=tuple(sorted(entries, key=lambda entry: -entry.count)),
     )

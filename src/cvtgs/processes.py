@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from multiprocessing import current_process, get_context
 from types import TracebackType
 from typing import Protocol, Self, TypeVar, runtime_checkable
 
@@ -55,6 +55,11 @@ def with_progress(results: Iterable[Result], advance: Callable[[int], None]) -> 
         advance(done)
 
 
+def can_start_processes() -> bool:
+    """Return whether this process may start others; those of ``multiprocessing.Pool`` may not."""
+    return not current_process().daemon
+
+
 def pool_size(count: int) -> int:
     """Return the number of processes that a pool can have on this system, at most ``count``."""
     return min(count, MOST_ON_WINDOWS) if sys.platform == "win32" else count
@@ -72,6 +77,7 @@ class LocalWorkers:
 
     Raises:
         InvalidArgumentError: The number is below 1.
+        RunError: This process is one of ``multiprocessing.Pool``, which may not start others.
     """
 
     def __init__(self, count: int, remedy: str = "with less --memory or fewer --workers") -> None:
@@ -81,6 +87,11 @@ class LocalWorkers:
     def __enter__(self) -> Self:
         from cvtgs.devices import core_count  # noqa: PLC0415 (loads torch; see _begin)
 
+        if not can_start_processes():
+            raise RunError(
+                "a process of multiprocessing.Pool may not start others; use "
+                "concurrent.futures.ProcessPoolExecutor in its place, or no workers here."
+            )
         context = get_context("spawn")  # fork would copy locks that torch's threads hold
         self._watched, self._alive = context.Pipe(duplex=False)
         threads = max(1, core_count() // self._count)

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from typing import Any
 from unicodedata import combining, east_asian_width
@@ -13,6 +13,7 @@ _UNSAFE = re.compile(
 """Control characters except tab and line feed, direction marks, and lone surrogates."""
 
 MOST_LETTERS = 60  # maximum length of a value in an error message
+MOST_NAMES = 10  # maximum number of columns or elements of a file that a message lists
 SETTING_LIKENESS = 0.82  # least likeness of an unknown setting to the one that is suggested
 
 
@@ -38,6 +39,11 @@ def printable(text: str, encoding: str = "utf-8") -> str:
     return text
 
 
+def printable_name(name: str) -> str:
+    """Escape also the tabs and line feeds of a text, so that it stays in its line."""
+    return printable(name).replace("\t", r"\t").replace("\n", r"\n")
+
+
 def _escaped(letter: str) -> str:
     return f"\\u{ord(letter):04x}" if ord(letter) < 1 << 16 else json.dumps(letter)[1:-1]
 
@@ -56,6 +62,13 @@ def suggestion(word: str, choices: Iterable[str], *, likeness: float = 0.6) -> s
     """Return "; did you mean X?" with the choice closest to a word; empty if none is close."""
     near = get_close_matches(word, list(choices), n=1, cutoff=likeness)
     return f"; did you mean {near[0]}?" if near else ""
+
+
+def first_of(texts: Sequence[str], *, between: str = ", ", length: int = MOST_LETTERS) -> str:
+    """List the first texts, each truncated to a length, and how many more there are."""
+    listed = between.join(shortened(text, length) for text in texts[:MOST_NAMES])
+    more = len(texts) - MOST_NAMES
+    return f"{listed}{between}and {more:,} more" if more > 0 else listed
 
 
 def size_text(count: int) -> str:

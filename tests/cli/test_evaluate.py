@@ -138,6 +138,7 @@ def test_tradeoff_against_photographs(folder, scenes, tmp_path, capsys):
         (["--views", "0"], "--views must be at least 1, found 0."),
         (["--views", "10001"], "--views must be at most 10,000, found 10,001."),
         (["--size", "-3"], "--size must be at least 1, found -3."),
+        (["--size", "20000"], "--size must be at most 16,384, found 20,000."),
         (["--split", "test"], "--split chooses among cameras and needs --cameras."),
         (["--background", "1,2,3"], "--background must be black, gray, white or red,green,blue"),
         (["--background", "pink"], "--background must be black, gray, white or red,green,blue"),

@@ -82,6 +82,10 @@ TRANSFORMS: Mapping[str, tuple[Callable[[Any], None], str]] = {
         put("frames", 3, "w", value=0),
         " frame 3: the image size must be from 1 to 1,048,576 pixels, found 0 x 48.",
     ),
+    "pixels": (
+        lambda document: document["frames"][3].update(w=20_000, h=20_000),
+        " frame 3: an image must have at most 268,435,456 pixels, found 20000 x 20000.",
+    ),
     "focal length below 0": (
         put("frames", 3, "fl_x", value=-5),
         " frame 3: focal lengths must be above 0 and the principal point finite, "

@@ -169,6 +169,10 @@ DAMAGE: dict[str, tuple[Change, str]] = {
         lambda d: rows(d, 1).update(file=0, offset=2),
         "each row of a file must be in one chunk, found row 2 of '0_0/meta.json' in two.",
     ),
+    "a file again": (
+        lambda d: d["filenames"].__setitem__(1, "./0_0/meta.json"),
+        "each file must be in 'filenames' or 'environment' once.",
+    ),
     "above": (
         lambda d: d["filenames"].__setitem__(0, "../0_0/meta.json"),
         OUTSIDE + "'../0_0/meta.json'.",

@@ -126,6 +126,13 @@ def test_a_ply_with_the_wrong_suffix_is_refused(tmp_path: Path) -> None:
         load(path)
 
 
+def test_a_web_page_in_place_of_the_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.splat"
+    path.write_bytes(b"<!DOCTYPE html><p>Not found".ljust(64))
+    with pytest.raises(FileFormatError, match="no header, found 64 bytes that start with b'<!DO'"):
+        load(path)
+
+
 def test_rows_of_zeros_are_read_as_small_faint_gaussians(tmp_path: Path) -> None:
     path = tmp_path / "a.splat"
     path.write_bytes(bytes(32))

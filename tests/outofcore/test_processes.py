@@ -1,6 +1,7 @@
 """Blocks in local processes: the same bits as in one process, errors, and how they end."""
 
 import math
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -192,3 +193,9 @@ def test_a_wrong_number_of_processes_is_refused(count):
 def test_processes_must_be_started():
     with pytest.raises(InvalidArgumentError, match="workers run inside `with LocalWorkers"):
         next(LocalWorkers(1)(abs, [-1]))
+
+
+def test_a_process_that_may_not_start_others_says_so(monkeypatch):
+    monkeypatch.setitem(vars(multiprocessing.current_process())["_config"], "daemon", True)
+    with pytest.raises(RunError, match=r"multiprocessing\.Pool may not start others; use"):
+        LocalWorkers(2).__enter__()

@@ -264,3 +264,14 @@ def test_a_job_that_fails_before_it_can_resume_leaves_no_folder(source, tmp_path
 def test_rows_that_cannot_be_written_are_one_sentence(tmp_path):
     with pytest.raises(OutputError, match=r"attempt_rows_\S*: the output must be writable, found"):
         Attempt(str(tmp_path / "gone")).append("rows", b"1")
+
+
+def test_a_listener_that_raises_at_the_end_leaves_only_the_output(source, tmp_path):
+    def stop(event):
+        if event.stage == "assemble" and event.done == event.total:
+            raise KeyError(event.stage)
+
+    with pytest.raises(KeyError, match="assemble"):
+        simplify_file(source, tmp_path / "out.ply", 0.05, blocks=3, listener=stop)
+    assert len(cvtgs.load(tmp_path / "out.ply")) == 1000
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.ply", "out.ply"]

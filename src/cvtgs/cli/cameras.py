@@ -26,6 +26,7 @@ COLORS: Mapping[str, Color] = {
 }
 AUTOMATIC_VIEWS = 8
 _MOST_VIEWS = 10_000
+_MOST_SIZE = 1 << 14  # pixels; images of 4 : 3 take some gigabytes then
 
 
 def add_view_options(parser: argparse.ArgumentParser, *, size: int, **helps: str) -> None:
@@ -50,10 +51,10 @@ def check_view_options(options: argparse.Namespace) -> None:
         value = getattr(options, name)
         if value is not None and value < 1:
             raise InvalidArgumentError(f"--{name} must be at least 1, found {value}.")
-    if options.views is not None and options.views > _MOST_VIEWS:
-        raise InvalidArgumentError(
-            f"--views must be at most {_MOST_VIEWS:,}, found {options.views:,}."
-        )
+    for name, most in (("views", _MOST_VIEWS), ("size", _MOST_SIZE)):
+        value = getattr(options, name)
+        if value is not None and value > most:
+            raise InvalidArgumentError(f"--{name} must be at most {most:,}, found {value:,}.")
     check_split(options)
     if getattr(options, "images", None) is not None and options.cameras is None:
         raise InvalidArgumentError("--images needs the cameras of the photographs: --cameras.")

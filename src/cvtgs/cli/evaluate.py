@@ -23,7 +23,7 @@ from cvtgs.cli.view import PAGE, check_page, write_page
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import windows_fault, write_atomically
 from cvtgs.progress import ProgressEvent
-from cvtgs.text import counted, printable, size_text
+from cvtgs.text import MOST_LETTERS, counted, printable_name, size_text
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation, SceneScores
@@ -90,7 +90,7 @@ def file_names(views: Sequence[str]) -> list[str]:
     for view in views:
         name = PurePosixPath(view.replace("\\", "/")).name
         bare = re.sub(r"\.(png|jpe?g|webp|tiff?|bmp)$", "", name, flags=re.IGNORECASE)
-        stem = re.sub(r"[^\w.-]+", "_", bare).strip("._") or "view"
+        stem = re.sub(r"[^\w.-]+", "_", bare).strip("._")[:MOST_LETTERS] or "view"
         is_device = windows_fault(PureWindowsPath(stem)) is not None
         stems.append(f"view_{stem}" if is_device else stem)
     if len({stem.lower() for stem in stems}) == len(stems):
@@ -112,9 +112,9 @@ def _read_scenes(options: argparse.Namespace) -> _Scenes:
     from cvtgs.devices import chosen_device
 
     paths = [options.reference, *expanded(options.small)]
-    names = [printable(path.name) for path in paths]
+    names = [printable_name(path.name) for path in paths]
     names = [
-        name if names.count(name) == 1 else printable(str(path))
+        name if names.count(name) == 1 else printable_name(str(path))
         for name, path in zip(names, paths, strict=True)
     ]
     twice = [name for name in names if names.count(name) > 1]

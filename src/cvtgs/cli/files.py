@@ -3,8 +3,8 @@
 import argparse
 import math
 import sys
-import warnings
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 import cvtgs
@@ -28,9 +28,9 @@ from cvtgs.cli.options import (
     read_settings,
 )
 from cvtgs.cli.paths import any_path
-from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, without_warnings
 from cvtgs.tags import described_tags
-from cvtgs.text import counted, printable, size_text
+from cvtgs.text import counted, first_of, size_text
 
 if TYPE_CHECKING:
     import pydantic
@@ -253,8 +253,8 @@ def _rows(facts: "SceneInfo") -> list[tuple[str, str]]:
         ),
         ("invalid rows", f"{facts.invalid_count:,}" + (f" ({invalid})" if invalid else "")),
         ("tags", described_tags(facts.comments) or "none"),
-        ("comments", "; ".join(facts.comments) or "none"),
-        ("extra columns", ", ".join(facts.extra_columns) or "none"),
+        ("comments", first_of(facts.comments, between="; ", length=200) or "none"),
+        ("extra columns", first_of(facts.extra_columns) or "none"),
     ]
     table = [("effect", ("state", "measured", "rule"))]
     table += [(name, _effect_cells(effect)) for name, effect in facts.plan]
@@ -331,14 +331,13 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
         alike = path.suffix.lower() == options.input.suffix.lower()
         source = axes.source if alike else None  # other formats have axes of their own
         scenes.append(cvtgs.io.load(path, axes=source, trust_sizes=options.trust_sizes))
-    with warnings.catch_warnings():
-        if not options.quiet:  # printed below instead
-            warnings.simplefilter("ignore", DroppedDataWarning)
+    # What is dropped is printed below instead.
+    with nullcontext() if options.quiet else without_warnings(DroppedDataWarning):
         scene = scenes[0] if len(scenes) == 1 else cvtgs.edit.merge(scenes)
     left = sorted({name for one in scenes for name in one.extras} - set(scene.extras))
     scene, phrases = edited(scene, edits)
     if left:
-        phrases.append(f"columns that not all scenes have ({', '.join(map(printable, left))})")
+        phrases.append(f"columns that not all scenes have ({first_of(left)})")
     if options.sh_degree is not None and options.sh_degree < scene.sh_degree:
         scene = scene.with_sh_degree(options.sh_degree)
         phrases += [f"SH bands above degree {options.sh_degree} (--sh-degree)"]
@@ -353,9 +352,7 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
             say_wrapped(phrase, indent=2, file=stream)
         rest = "nothing else" if lost.changed else "nothing"
         say_wrapped(f"Lost: {'; '.join([*phrases, *lost.dropped]) or rest}.", file=stream)
-    with warnings.catch_warnings():
-        if not options.quiet:  # printed here instead
-            warnings.simplefilter("ignore", DroppedDataWarning)
+    with nullcontext() if options.quiet else without_warnings(DroppedDataWarning):
         cvtgs.io.save(
             scene,
             options.output,

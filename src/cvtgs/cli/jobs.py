@@ -28,7 +28,7 @@ from cvtgs.errors import (
     OutputError,
     RunError,
 )
-from cvtgs.text import counted, printable, shortened, shown, size_text
+from cvtgs.text import counted, printable_name, shortened, shown, size_text
 
 STREAM = "-"  # the path that stands for standard input or output
 
@@ -183,14 +183,14 @@ def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> N
             outcome = work(job)
         except CvtgsError as error:
             failed += 1
-            say(f"cvtgs: error: {place}{error}", file=sys.stderr)
+            say(printable_name(f"cvtgs: error: {place}{error}"), file=sys.stderr)
             continue
         bytes_out = cvtgs.io.scene_size(target)
         before, after = before + bytes_in, after + bytes_out
         if not quiet:
             facts = outcome.facts(bytes_in, bytes_out)
             room = max(8, WIDTH - len(place) - len(facts) - 2)
-            say(f"{place}{shortened(printable(target.name), room)}: {facts}", flush=True)
+            say(f"{place}{shortened(printable_name(target.name), room)}: {facts}", flush=True)
             for note in outcome.notes:
                 say_wrapped(note, indent=len(place))
     done = len(jobs) - failed
@@ -209,7 +209,7 @@ def _run_one(job: SceneJob, work: Callable[[SceneJob], Outcome]) -> None:
     before = cvtgs.io.scene_size(options.input)
     outcome = work(job)
     facts = outcome.facts(before, cvtgs.io.scene_size(options.output))
-    stream, name = sys.stdout, printable(str(options.output))
+    stream, name = sys.stdout, printable_name(str(options.output))
     if job.to_stream:
         stream, name = sys.stderr, STANDARD_OUTPUT
         send_file(options.output)

@@ -29,6 +29,7 @@ from cvtgs.cli.train import add_train
 from cvtgs.cli.view import add_view
 from cvtgs.errors import CvtgsError, InvalidArgumentError, memory_errors
 from cvtgs.startup import load_torch
+from cvtgs.text import printable_name
 
 WRITE_SEVERAL = ("levels", "render", "compare", "tradeoff", "demo", "train")
 """Commands that write several files to one folder, which only one run at a time may do."""
@@ -58,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise
             if _is_closed_pipe(error.__cause__):  # as in "cvtgs info | head"
                 return PIPE_CLOSED
-            say(f"cvtgs: error: {error}", file=sys.stderr)
+            say(printable_name(f"cvtgs: error: {error}"), file=sys.stderr)
             return 1
         finally:
             sys.unraisablehook = hook
@@ -234,4 +235,4 @@ def build_parser() -> CommandParser:
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    say(f"cvtgs: warning: {message}", file=sys.stderr)
+    say(printable_name(f"cvtgs: warning: {message}"), file=sys.stderr)

@@ -19,7 +19,7 @@ from cvtgs.cli.options import (
 from cvtgs.cli.paths import any_path, new_file
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import write_atomically
-from cvtgs.text import printable
+from cvtgs.text import printable_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -124,7 +124,7 @@ def view(options: argparse.Namespace) -> None:
             )
     check_viewer()
     scene, *others = (cvtgs.load(path, trust_sizes=options.trust_sizes) for path in names)
-    named = {printable(str(path)): other for path, other in zip(small, others, strict=True)}
+    named = {printable_name(str(path)): other for path, other in zip(small, others, strict=True)}
     viewer = SceneViewer(scene, named, device=options.device)
     server = ViewerServer(
         viewer, host=options.host, port=options.port, preset=preset, rho=options.rho

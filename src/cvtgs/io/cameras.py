@@ -23,6 +23,7 @@ from cvtgs.errors import (
 from cvtgs.io.files import is_file, is_folder, read_json
 
 MAX_PIXELS = 1 << 20  # largest width and height of images; a larger number is considered damaged
+MAX_AREA = 1 << 28  # largest number of pixels of an image, for which rendering takes some gigabytes
 
 _SKEW = 0.01
 _TEST_EVERY = 8
@@ -66,6 +67,11 @@ def checked_lens(lens: Lens, where: str) -> Lens:
     if not (1 <= lens.width <= MAX_PIXELS and 1 <= lens.height <= MAX_PIXELS):
         raise FileFormatError(
             f"{where}: the image size must be from 1 to {MAX_PIXELS:,} pixels, "
+            f"found {lens.width} x {lens.height}."
+        )
+    if lens.width * lens.height > MAX_AREA:
+        raise FileFormatError(
+            f"{where}: an image must have at most {MAX_AREA:,} pixels, "
             f"found {lens.width} x {lens.height}."
         )
     numbers = (lens.fx, lens.fy, lens.cx, lens.cy)

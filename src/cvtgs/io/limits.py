@@ -8,7 +8,7 @@ import torch
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 from cvtgs.tags import ANTIALIASED, TWO_SCALES
-from cvtgs.text import counted
+from cvtgs.text import counted, first_of
 from cvtgs.validity import writable_rows
 
 SCALE_RANGE = (-87.3, 88.7)  # logarithms of the scales that float32 holds with full precision
@@ -167,7 +167,7 @@ def dropped_within(scene: GaussianScene, limits: FormatLimits) -> dict[str, int]
     """Return the lost data, and of clamped data the number of Gaussians, otherwise 0."""
     dropped = {}
     if scene.extras:
-        names = ", ".join(map(repr, scene.extras))
+        names = first_of([*map(repr, scene.extras)])
         dropped[f"extra {'columns' if len(scene.extras) > 1 else 'column'} {names}"] = 0
     if scene.sh_degree > limits.sh_degree:
         own = f"the scene has degree {scene.sh_degree}"

@@ -35,6 +35,7 @@ _ROW = np.dtype(
         ("quat", "u1", 4),
     ]
 )
+_OTHERS = (b"ply\n", b"ply\r", b"<!do", b"<htm", b"<?xm")  # starts of PLY files and web pages
 _CHUNK_ROWS = 1 << 16
 
 HEADER_BYTES, SECTION_BYTES = 4096, 1024
@@ -62,7 +63,7 @@ def read_splat(path: Path) -> GaussianScene:
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
         start = file.read(4)
-        if size == 0 or size % _ROW.itemsize or start in (b"ply\n", b"ply\r"):
+        if size == 0 or size % _ROW.itemsize or start.lower() in _OTHERS:
             raise FileFormatError(
                 f"{path}: a .splat file must hold one or more Gaussians of {_ROW.itemsize} bytes "
                 f"each and no header, found {size:,} bytes that start with {start!r}."

@@ -23,7 +23,7 @@ from cvtgs.errors import (
 from cvtgs.io.tensors import pack_tensors, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet
 from cvtgs.mergenet.published import Net, PublishedArchitecture, PublishedMergeNet
-from cvtgs.text import printable, shown
+from cvtgs.text import printable, printable_name, shown
 
 SHIPPED = ("standard", "paper")
 """Names of the checkpoints that come with the package."""
@@ -137,7 +137,7 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
             f"{str(metadata.get('sha256'))[:12]}..., found {digest[:12]}..."
         )
     return Checkpoint(
-        net=_build_net(info, tensors, name), info=info, name=printable(name), digest=digest
+        net=_build_net(info, tensors, name), info=info, name=printable_name(name), digest=digest
     )
 
 
@@ -178,7 +178,7 @@ def _read(path: Path, name: str) -> bytes:
             return path.read_bytes()
         path.stat()
     except (FileNotFoundError, ValueError):
-        preset = f" For the preset, write preset={name!r}." if name in PRESETS else ""
+        preset = f" For the preset, write preset={name!r} (--preset {name})." if name in PRESETS else ""
         raise CheckpointError(
             f"{name}: no such checkpoint; it must be {' or '.join(SHIPPED)}, or a file.{preset}"
         ) from None

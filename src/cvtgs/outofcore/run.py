@@ -182,12 +182,15 @@ def simplify_file(  # noqa: PLR0913 (options by name)
                 with one_thread():
                     job.write_manifest(_scan_and_sort(job, key, workers, clock))
         energies = _group(job, workers, clock) if job.goes_by_steps else ()
-        resumed = _run_blocks(job, workers, clock)
-        with clock.stage("assemble"):
-            assemble_blocks(job, output, axes=output_axes, overwrite=overwrite)
-        report = report_blocks(job, simplifier, clock, energies=energies, resumed=resumed)
-        shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
-    return report
+        resumed, is_complete = _run_blocks(job, workers, clock), False
+        try:
+            with clock.stage("assemble"):
+                assemble_blocks(job, output, axes=output_axes, overwrite=overwrite)
+                is_complete = True
+            return report_blocks(job, simplifier, clock, energies=energies, resumed=resumed)
+        finally:
+            if is_complete:  # also if the listener raises at the last event
+                shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
 
 
 def rows_per_range(count: int) -> int:

@@ -27,7 +27,7 @@ from cvtgs.io import load, scene_file, scene_size
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import SimplifyReport
 from cvtgs.scene import GaussianScene
-from cvtgs.text import printable
+from cvtgs.text import printable_name
 from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult, with_fronts
 from cvtgs.views import automatic_views, find_own_cameras
 
@@ -336,7 +336,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         for failure in failures:
             warn(f"{failure.name} failed: {failure.reason}")
         sizes = {run.task.name: run.path.stat().st_size for run in runs}
-        source_name = printable(Path(source).name)
+        source_name = printable_name(Path(source).name)
         comparison = compare(
             full,
             {run.task.name: load(run.path).to(where) for run in runs},

@@ -35,7 +35,7 @@ from cvtgs.mergenet import (
     summarize,
 )
 from cvtgs.mergenet.checkpoint import build_network
-from cvtgs.processes import LocalWorkers
+from cvtgs.processes import LocalWorkers, can_start_processes
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.train.cases import Case, DeviceCopies
 from cvtgs.train.config import TrainConfig
@@ -245,7 +245,8 @@ def step_gradients(
     number of the case, so that the number of processes changes rounding only.
     """
     numbers = range(config.cases_per_step)
-    processes = min(config.cases_per_step, thread_count()) if copies.device.type == "cpu" else 1
+    has_processes = copies.device.type == "cpu" and can_start_processes()
+    processes = min(config.cases_per_step, thread_count()) if has_processes else 1
     if processes == 1:
         yield lambda net, step: [
             _case_gradient(net, cases, config, copies, step, number) for number in numbers

@@ -89,11 +89,13 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
         sources.append((_inside(path, meta.environment), []))
     if not sources:
         raise FileFormatError(f"{path}: level {lod} must hold at least one Gaussian, found none.")
-    stored = sum(scene_size(source) for source in dict(sources))  # each once
+    if len(dict(sources)) < len(sources):  # a short file could make reading take hours
+        raise FileFormatError(f"{path}: each file must be in 'filenames' or 'environment' once.")
+    stored = sum(scene_size(source) for source, _ in sources)
     scenes: list[GaussianScene] = []
     for source, parts in sources:
         scenes.append(_read_rows(source, parts, trust_sizes=trust_sizes))
-        if not trust_sizes:  # many small files, or the same one many times
+        if not trust_sizes:  # many small files
             count, degree = sum(map(len, scenes)), max(scene.sh_degree for scene in scenes)
             check_expansion(path, count=count, sh_degree=degree, stored=stored)
     return scenes[0] if len(scenes) == 1 else merge(scenes)
