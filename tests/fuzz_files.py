@@ -172,6 +172,9 @@ def judged(read: Callable[[Path], object], path: Path) -> Verdict:
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
+            # From torch, as it refuses a checkpoint. Only filters of the process could hide it,
+            # which threads of a program would spoil for each other.
+            warnings.filterwarnings("ignore", "TypedStorage is deprecated")
             read(path)
         result = "read"
     except MemoryError:

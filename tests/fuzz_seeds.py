@@ -133,6 +133,12 @@ def sog_files() -> Files:
     return dict(encode_sog(random_scene(9, degree=1)).files())
 
 
+def stream_files() -> Files:
+    """Return the files of a SOG, and those of another for the environment."""
+    files = sog_files()
+    return files | {f"env/{name}": content for name, content in files.items()}
+
+
 def seeds_of_streams() -> list[bytes]:
     """Return streams of two chunks of one SOG, in two levels, one with an environment."""
     near = {"0": {"file": 0, "offset": 0, "count": 3}, "1": {"file": 0, "offset": 3, "count": 2}}
@@ -143,7 +149,7 @@ def seeds_of_streams() -> list[bytes]:
         "children": [{"bound": bound, "lods": near}, {"bound": bound, "lods": far}],
     }
     document = {"version": 1, "lodLevels": 2, "counts": [7, 6], "filenames": ["meta.json"]}
-    whole = document | {"environment": "meta.json", "tree": tree}
+    whole = document | {"environment": "env/meta.json", "tree": tree}
     return [json.dumps(found).encode() for found in (document | {"tree": tree}, whole)]
 
 
@@ -204,7 +210,9 @@ READERS: dict[str, Kind] = {
         read=cvtgs.load,
         beside=sog_files,
     ),
-    "stream": Kind(name="lod-meta.json", seeds=seeds_of_streams, read=cvtgs.load, beside=sog_files),
+    "stream": Kind(
+        name="lod-meta.json", seeds=seeds_of_streams, read=cvtgs.load, beside=stream_files
+    ),
     "colmap.cameras": colmap("cameras.bin", colmap_bin),
     "colmap.images": colmap("images.bin", colmap_bin),
     "colmap.txt": colmap("images.txt", colmap_txt),
@@ -219,5 +227,6 @@ def place(kind: str, folder: Path) -> Path:
         f"damaged{READERS[kind].name}" if READERS[kind].name[0] == "." else READERS[kind].name
     )
     for other, data in READERS[kind].beside().items():
+        (home / other).parent.mkdir(exist_ok=True)
         (home / other).write_bytes(data)
     return path

@@ -251,3 +251,8 @@ def test_wrong_arguments(call, text):
     with pytest.raises(InvalidArgumentError) as caught:
         call()
     assert str(caught.value).endswith(text)
+
+
+def test_flyaways_may_hold_exactly_the_share():
+    distances, masses = torch.tensor([1.0, 200.0]), torch.tensor([3.0, 1.0])
+    assert flyaway_rows(distances, masses, max_share=0.25).tolist() == [False, True]

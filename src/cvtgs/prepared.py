@@ -242,9 +242,12 @@ class Prepared:
             analysis = analyze(valid, self._config, with_visibility=sees and not is_whole)
         if not is_whole:
             if analysis.plan.visibility.active:
-                with clock.stage("visibility"):
+                images = self._config.visibility.views
+                if self._cameras is not None:
+                    images = min(images, len(self._cameras))
+                with clock.stage("visibility", images) as advance:
                     analysis = measure_contributions(
-                        valid, analysis, self._config, cameras=self._cameras
+                        valid, analysis, self._config, cameras=self._cameras, on_image=advance
                     )
             self._analysis = analysis
         return checked, analysis

@@ -19,6 +19,7 @@ from cvtgs.analysis.effects import (
     drop_mip_tag,
     duplicate_share,
     far_share,
+    haze_share,
     select_columns,
 )
 from cvtgs.math.frames import RobustFrame, robust_frame
@@ -355,3 +356,11 @@ def test_forced_choices_drop_bands_columns_and_the_tag():
     assert (chosen.sh_degree, dict(chosen.extras)) == (1, {})
     assert drop_mip_tag(scene, plan_of(scene)) is scene
     assert not drop_mip_tag(scene, plan_of(scene, mip="off")).antialiased
+
+
+def test_what_is_never_drawn_is_no_haze():
+    least = 1 / 255 + 1e-4
+    config = SimplifyConfig.from_mapping({"filter": {"min_opacity": 2 * least}})
+    opacities = torch.tensor([0.001, least, 0.9])
+    found = haze_share(opacities, torch.tensor([10.0, 1.0, 3.0]), config)
+    assert float(found) == pytest.approx(1 / (1 + 3))

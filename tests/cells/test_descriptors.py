@@ -9,9 +9,10 @@ import torch
 import mergenet_oracle as oracle
 import oracles
 from cvtgs import GaussianScene
-from cvtgs.cells import describe_cells
+from cvtgs.cells import Partition, describe_cells, merge_cells
 from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES
 from cvtgs.cells.partition import MOST_SAMPLED, sample_members
+from cvtgs.config import MergeConfig
 from cvtgs.math.segments import segment_sum
 from mergenet_cases import (
     Case,
@@ -299,3 +300,28 @@ def test_descriptors_of_some_cells():
             assert getattr(found, name).equal(getattr(seen, name)[members])
         for name in ("pairs", "cells", "pair_positions"):
             assert getattr(found, name).equal(getattr(seen, name)[chosen])
+
+
+def test_small_cells_do_not_depend_on_sampled_ones():
+    """Weights of the merge are not masses here, so the mean of a small cell is not its centre."""
+    config = MergeConfig(area_power=0.0)
+    many = 3 * MOST_SAMPLED
+    labels = torch.cat([torch.zeros(5, dtype=torch.int64), torch.ones(many, dtype=torch.int64)])
+    scene = random_scene(5 + many, degree=1)
+    part = Partition.from_labels(labels, 2)
+    merged = merge_cells(scene, part, config=config)
+    both, alone = (
+        describe_cells(
+            scene,
+            merged,
+            part.select(torch.tensor([True, has_large])),
+            cells=torch.arange(1 + has_large),
+            neighbors=torch.tensor([[1], [0]])[: 1 + has_large],
+            sizes=part.counts,
+            visibility=torch.ones(5 + many).double(),
+            pixel_size=0.01,
+        )
+        for has_large in (True, False)
+    )
+    torch.testing.assert_close(both.positions[:5], alone.positions)
+    torch.testing.assert_close(both.members[:5], alone.members)

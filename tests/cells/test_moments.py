@@ -9,7 +9,7 @@ from scipy.special import spence
 
 import oracles
 from cvtgs import GaussianScene
-from cvtgs.cells import Partition, merge_cells
+from cvtgs.cells import Partition, gaussian_moments, merge_cells
 from cvtgs.cells.merge import (
     FULL_DEPTH,
     depth_from_integrated,
@@ -21,6 +21,7 @@ from cvtgs.cells.merge import (
 from cvtgs.cells.moments import mass_unit
 from cvtgs.config import MergeConfig
 from cvtgs.math import parameters
+from cvtgs.math.frames import RobustFrame
 from cvtgs.tags import ANTIALIASED
 from scenes import assert_same_gaussians, covariances_of, moved, oracle_rows, random_scene
 
@@ -227,3 +228,12 @@ def test_shape_and_dtype_of_depths_are_kept(function, shape):
     for dtype in (torch.float32, torch.float64):
         result = function(torch.full(shape, 0.25, dtype=dtype))
         assert (result.shape, result.dtype) == (shape, dtype)
+
+
+def test_colours_of_moments_are_from_black_to_one_and_a_half():
+    scene = random_scene(2, degree=0)
+    scene = scene.with_tensors({"sh0": torch.tensor([[[-9.0] * 3], [[9.0] * 3]])}, {})
+    frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
+    ones = torch.ones(2)
+    found = gaussian_moments(scene, torch.arange(2), frame, masses=ones, apparent_masses=ones)
+    assert found.colors.T.tolist() == [[0.0] * 3, [1.5] * 3]

@@ -139,3 +139,13 @@ def test_pairs_with_like_view_dependent_colours_merge_first(weight, together):
 def test_blocks_compare_the_same_components(tmp_path):
     job = unfinished_job(with_bands(smooth_bands()), tmp_path, count=200, blocks=4)
     assert job.read_scan().view_components.shape == (45, 2)
+
+
+def test_the_variance_that_neighbours_have_in_common_by_hand():
+    """Variance 2.5 / 5 = 0.5; half the mean squared step, (0.25 + 1 + 0.25) / 6 = 0.25."""
+    bands = torch.zeros(4, 3, 3)
+    bands[:, 0, 0] = torch.tensor([-1.0, -0.5, 0.5, 1.0])
+    scene = random_scene(4, degree=1).with_tensors({"shN": bands}, {})
+    found = view_components(scene, torch.arange(4), torch.ones(4))
+    assert found.shape == (9, 1)
+    assert float(found.abs().amax()) == pytest.approx(math.sqrt(0.5))

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from cvtgs.cvt import stratified_seeds, weighted_seeds
-from cvtgs.cvt.tessellate import sample_points
+from cvtgs.cvt.tessellate import MIN_SAMPLES, sample_points
 
 
 def weights_of(kind: str, count: int) -> torch.Tensor:
@@ -135,3 +135,17 @@ def test_weights_are_not_changed():
     stratified_seeds(weights, 10)
     drawn(weights, 10)
     assert torch.equal(weights, before)
+
+
+@pytest.mark.parametrize(
+    ("total", "used"),
+    [(2 * MIN_SAMPLES, 2 * MIN_SAMPLES), (2 * MIN_SAMPLES + 2, MIN_SAMPLES)],
+)
+def test_points_are_sampled_only_if_that_leaves_out_half(total, used):
+    points, weights = sample_points(torch.zeros(total, 1), torch.ones(total), 1)
+    assert len(points) == len(weights) == used
+    assert float(weights.sum()) == total
+
+
+def test_seeds_are_the_middles_of_equal_steps():
+    assert stratified_seeds(torch.ones(99), 2)[0].tolist() == [24, 74]  # 24.75 and 74.25

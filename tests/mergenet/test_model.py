@@ -343,3 +343,14 @@ def test_training_cells_keep_their_residuals():
     net.known.fit([summarize(case.describe())])
     after = fields_of(net(case.describe()))
     assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+def test_neighbours_turn_a_cell_by_twice_their_mean_pull():
+    seen = some_case(60, 12).describe()
+    net = MergeNet(Architecture()).double()
+    with torch.no_grad():
+        net.pair_gates.gates.bias[2:] = 1.0
+        found = net(seen).d_rotvecs
+    x, y, z = (seen.pair_positions / (1 + seen.pair_positions.abs())).unbind(2)
+    mean = torch.stack([y * z, x * z, x * y], dim=2).mean(dim=1)
+    torch.testing.assert_close(found, 0.5 * torch.tanh(2 * 0.5 * math.tanh(1.0) * mean))

@@ -10,7 +10,7 @@ from cvtgs.analysis import ambient_visibility
 from cvtgs.config import Rates
 from cvtgs.math import parameters
 from cvtgs.math.frames import robust_frame
-from cvtgs.refinement import refine
+from cvtgs.refinement import optimize, refine
 from cvtgs.refinement.optimize import SceneOptimizer, learning_rate_scales
 from cvtgs.refinement.refine import changed_count
 from refine_cases import as_dtype, discolored, full_scene, quick, small_scene
@@ -270,3 +270,11 @@ def test_a_loss_without_gradients_changes_nothing():
     optimizer.step(torch.tensor(1.0), factor=1.0)
     optimizer.step(optimizer.scene().sh0.sum() * 0, factor=1.0)
     assert same_bits(optimizer.result(), scene)
+
+
+def test_the_upper_quartile_of_five_sizes_is_the_fourth():
+    sizes = torch.tensor([0.0, 1.0, 2.0, 3.0, 90.0])
+    scene = random_scene(5, degree=0)
+    scene = scene.with_tensors({"log_scales": sizes[:, None].expand(5, 3).contiguous()}, {})
+    found = vars(optimize)["_size_factors"](scene, torch.ones(5, dtype=torch.bool))
+    assert float(found[4].log()) == pytest.approx(math.log(optimize.LARGE) + 3 - 90)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from cvtgs import GaussianScene, Simplifier, target_count
+from cvtgs import GaussianScene, Simplifier, SimplifyConfig, target_count
 from cvtgs.boxes import check_room
 from cvtgs.counts import read_count, read_ratio
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
@@ -304,3 +304,15 @@ def test_counts_of_other_types_are_errors(number):
     for wish in ("count", "max_count"):
         with pytest.raises(InvalidArgumentError, match=f"{wish} must be a whole number"):
             target_count(10, None, **{wish: number})
+
+
+def test_a_scene_whose_valid_rows_all_stay_is_not_refined():
+    scene = random_scene(40, degree=0)
+    means = scene.means.clone()
+    means[0] = NAN
+    config = SimplifyConfig.from_mapping({"refine": {"steps": 1, "size": 32, "stride": 1}})
+    simplifier = Simplifier(config=config, device="cpu")
+    with pytest.warns(DroppedDataWarning, match="dropped 1 of 40"):
+        report = simplifier.run(scene.with_tensors({"means": means}, {}), count=39).report
+    assert report.refinement is None
+    assert report.views == "none"

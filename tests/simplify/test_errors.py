@@ -136,3 +136,38 @@ def test_factors_follow_the_errors_of_a_cell_and_its_neighbours():
 def same(one: cvtgs.GaussianScene, other: cvtgs.GaussianScene) -> bool:
     pairs = zip(one.tensors().values(), other.tensors().values(), strict=True)
     return all(torch.equal(a, b) for a, b in pairs)
+
+
+def test_errors_are_those_of_cells_and_not_of_protected_gaussians(monkeypatch):
+    scene, seen = make("object", COUNT, sh_degree=0, seed=0), []
+
+    def factors(small, partition, **values):
+        seen.append(values["errors"].tolist())
+        return torch.ones(values["count"], dtype=torch.float64)
+
+    monkeypatch.setattr(cvtgs.prepared, "importance_by_errors", factors)
+    monkeypatch.setattr(cvtgs.rendering, "error_shares", lambda drawn, _: torch.arange(len(drawn)))
+    values = {
+        "preset": "matched",
+        "match": {"error_power": 1.0},
+        "visibility": {"views": 2, "size": 32, "stride": 1},
+        "refine": {"steps": 0},
+    }
+    simplifier = Simplifier(config=SimplifyConfig.from_mapping(values), device="cpu")
+    cameras = automatic_views(scene, 2, width=32, height=32)
+    simplifier.simplify(scene, count=30, keep=torch.arange(COUNT) < 10, cameras=cameras)
+    assert seen == [list(range(10, 30))]
+
+
+def test_factors_of_errors_have_a_geometric_mean_of_one():
+    """Of those that images show: the others have a factor near 1 and do not count."""
+    small, part = random_scene(30, seed=1), Partition.from_labels(torch.arange(30), 30)
+    found = importance_by_errors(
+        small,
+        part,
+        errors=torch.linspace(1, 3, 30).double(),
+        pixels=torch.where(torch.arange(30) < 15, 1e6, 1.0),
+        count=30,
+        power=1.0,
+    )
+    assert float(found.log().sum()) == pytest.approx(0.0, abs=1e-9)

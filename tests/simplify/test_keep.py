@@ -188,3 +188,10 @@ def test_the_command_keeps_the_gaussians_in_boxes(scene, tmp_path):
     assert len(small) == 200
     assert same_bits(small.select(torch.arange(len(kept))), kept)
     assert main([*words, "--rho", "0.01", "--overwrite"]) == 1
+
+
+def test_a_ratio_of_one_with_kept_rows_changes_no_bits():
+    scene = random_scene(40, degree=1)
+    scene = scene.with_tensors({"quats": 5 * scene.quats}, {})
+    small = Simplifier(device="cpu").simplify(scene, 1.0, keep=torch.arange(40) >= 30)
+    assert same_bits(small, scene.select(torch.cat([torch.arange(30, 40), torch.arange(30)])))

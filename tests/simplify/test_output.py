@@ -9,7 +9,7 @@ import torch
 import cvtgs
 from cvtgs import GaussianScene, ProgressEvent, Simplifier, SimplifyConfig
 from cvtgs.errors import CvtgsError, DeviceError, InvalidSceneError
-from cvtgs.validity import invalid_rows
+from cvtgs.validity import invalid_rows, standardized
 from refine_cases import ring
 from scenes import assert_standard, random_scene, same_bits
 
@@ -198,3 +198,20 @@ def test_cuda_gives_a_standard_scene_on_the_device_of_the_input(preset):
     assert len(first) == 200
     assert_standard(first)
     assert same_bits(first, second)
+
+
+def test_every_image_of_contributions_is_an_event():
+    events: list[ProgressEvent] = []
+    images = {"views": 5, "size": 32, "stride": 1}
+    config = SimplifyConfig.from_mapping(
+        {"preset": "matched", "visibility": images, "refine": {"steps": 0}}
+    )
+    Simplifier(config=config, device="cpu", listener=events.append).simplify(random_scene(200), 0.1)
+    found = [(event.done, event.total) for event in events if event.stage == "visibility"]
+    assert found == [(done, 5) for done in range(6)]
+
+
+def test_short_quaternions_are_normalized():
+    scene = random_scene(3, degree=0)
+    short = scene.with_tensors({"quats": 0.5 * scene.quats}, {})
+    torch.testing.assert_close(standardized(short).quats.norm(dim=1), torch.ones(3))

@@ -212,3 +212,19 @@ def test_a_camera_looks_at_what_is_in_its_image(pixel, is_seen):
     tensors = {"means": place, "logit_opacities": torch.ones(1)}
     scene = random_scene(1).with_tensors(tensors, {})
     assert vars(own)["_looking"](cameras, scene).tolist() == [is_seen]
+
+
+@pytest.mark.parametrize(("count", "growth"), [(7, 0.0), (8, 1.0)])
+def test_eight_gaussians_in_a_direction_show_how_sizes_grow(count, growth):
+    x = 0.5 * torch.arange(1, count + 1, dtype=torch.float64)
+    sized = layout.SizedPoints(torch.stack([x, 0 * x, 0 * x], dim=1), x.log())
+    eye = torch.zeros(1, 3, dtype=torch.float64)
+    assert layout.size_growths(sized, eye, 1.0) == pytest.approx([growth])
+
+
+def test_a_floor_with_half_of_all_beneath_it_counts_as_none():
+    side = 0.15 * (torch.arange(10).double() + 0.5)
+    floor = torch.nn.functional.pad(torch.cartesian_prod(side, side), (0, 1))
+    below = torch.cat([floor[:10] - (1 + 0.3 * step) * UP for step in range(10)])
+    found = vars(up)["_lowest_level"](voxels_at(torch.cat([floor, below]), UP), UP)
+    assert (found.share, found.bare) == (0.0, 0.0)

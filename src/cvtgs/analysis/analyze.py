@@ -1,5 +1,6 @@
 """SceneAnalysis, computed once for all stages: frame, areas, ambient visibility, contributions."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -267,12 +268,16 @@ def measure_contributions(
     config: SimplifyConfig,
     *,
     cameras: Cameras | None = None,
+    on_image: Callable[[int], None] = lambda done: None,
 ) -> SceneAnalysis:
-    """Correct apparent areas, and the haze effect, by the contributions to images of the scene."""
+    """Correct apparent areas, and the haze effect, by the contributions to images of the scene.
+
+    ``on_image`` is called with the number of finished images, if they are kept.
+    """
     used, observed = drop_unused_bands(scene, analysis.plan), None
     views = visibility_cameras(used, config, cameras=cameras)
     if config.match.enabled or (cameras is not None and config.match.error_power > 0.0):
-        observed = observe(used, views)
+        observed = observe(used, views, on_image=on_image)
         rendered = observed.contributions
     else:
         rendered = contributions(used, views)

@@ -46,6 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         warnings.simplefilter("always", UserWarning)
+        # Of a damaged checkpoint, before it is refused.
+        warnings.filterwarnings("ignore", "TypedStorage is deprecated", module="torch")
         try:
             _run(sys.argv[1:] if arguments is None else arguments, stop)
         except (KeyboardInterrupt, Exception) as error:

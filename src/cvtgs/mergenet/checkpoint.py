@@ -178,7 +178,9 @@ def _read(path: Path, name: str) -> bytes:
             return path.read_bytes()
         path.stat()
     except (FileNotFoundError, ValueError):
-        preset = f" For the preset, write preset={name!r} (--preset {name})." if name in PRESETS else ""
+        preset = (
+            f" For the preset, write preset={name!r} (--preset {name})." if name in PRESETS else ""
+        )
         raise CheckpointError(
             f"{name}: no such checkpoint; it must be {' or '.join(SHIPPED)}, or a file.{preset}"
         ) from None

@@ -1,6 +1,6 @@
 """Differentiable rendering of scenes, and the contribution of each Gaussian to the images."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,12 +15,7 @@ from cvtgs.errors import InvalidArgumentError, memory_errors
 from cvtgs.math import parameters
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.rendering.backends import (
-    BackendName,
-    BlendingWeights,
-    choose_backend,
-    without_gradients,
-)
+from cvtgs.rendering.backends import BackendName, BlendingWeights, choose_backend, without_gradients
 from cvtgs.scene import GaussianScene, SceneLike, as_scene, check_scene
 from cvtgs.text import counted, shown
 
@@ -229,7 +224,11 @@ def check_amounts(amounts: object, name: str, count: int, *, ignored: int = 0) -
 @torch.no_grad()
 @without_autocast()
 def observe(
-    scene: GaussianScene, cameras: Cameras, *, backend: BackendName = "auto"
+    scene: GaussianScene,
+    cameras: Cameras,
+    *,
+    backend: BackendName = "auto",
+    on_image: Callable[[int], None] = lambda done: None,
 ) -> ObservedViews:
     """Render a scene and sum each Gaussian's contribution, in one pass where the backend can.
 
@@ -237,6 +236,7 @@ def observe(
         scene: The Gaussians.
         cameras: The cameras, at least one.
         backend: The backend, as in :func:`cvtgs.rendering.render`.
+        on_image: Called with the number of finished images.
 
     Returns:
         The results of :func:`cvtgs.rendering.render` and :func:`cvtgs.rendering.contributions`,
@@ -265,6 +265,7 @@ def observe(
     for output, found in chosen.observe(scene, cameras, sh_degree=scene.sh_degree):
         total += found
         outputs.append(output)
+        on_image(len(outputs))
     return ObservedViews(
         cameras=cameras,
         rgb=torch.cat([output.rgb for output in outputs]),
