@@ -61,6 +61,18 @@ def oldest(session: nox.Session) -> None:
     )
 
 
+@nox.session(venv_backend="uv")
+def newest(session: nox.Session) -> None:
+    """Quick tests with the newest versions of all dependencies; needs uv.
+
+    ``nox -s newest --force-python 3.13`` uses another Python; for ``UV_TORCH_BACKEND`` see above.
+    """
+    session.install("-e", ".[test]")
+    session.run(
+        "pytest", *PARALLEL, "-m", "not slow and not long", "-W", "default", *session.posargs
+    )
+
+
 @nox.session
 def coverage(session: nox.Session) -> None:
     """All tests with line and branch coverage, at least 95 %."""

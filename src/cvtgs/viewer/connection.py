@@ -84,7 +84,10 @@ def _refusing_other_sites(names: set[str]) -> Iterator[None]:
     def checking(*args: Any, process_request: Any, **more: Any) -> Any:
         async def respond(connection: Any, request: Any) -> Any:
             if not is_own(request.headers, names):
-                text = "Only the page at the address that cvtgs printed may connect.\n"
+                text = (
+                    "Only the page at the address that cvtgs printed may connect; with --host "
+                    "0.0.0.0, any page may.\n"
+                )
                 return connection.respond(HTTPStatus.FORBIDDEN, text)
             found = process_request(connection, request)
             return await found if isawaitable(found) else found

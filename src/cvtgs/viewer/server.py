@@ -168,7 +168,8 @@ class ViewerServer:
 
     Args:
         viewer: The scenes.
-        host: Address to listen on.
+        host: Address to listen on. On one of this machine alone, only the page itself may connect;
+            on another, anyone who reaches it may use the page.
         port: Port to listen on; if it is taken, the next free one.
         preset: Preset to start with.
         rho: Ratio to start with, in (0, 1]; it is exact until the slider is moved.
