@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from cvtgs.cameras import Cameras, join_cameras, look_at
+from cvtgs.cameras import Cameras, join_cameras, look_at, view_scales
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.rendering import render
 from refine_cases import ring
@@ -308,3 +308,11 @@ def test_joined_cameras_keep_what_each_is_like():
     assert joined.ignores_tag == (False,) * len(one) + (True,) * len(two)
     assert torch.equal(joined.Ks[len(one) :], two.Ks)
     assert torch.equal(joined.viewmats[: len(one)], one.viewmats)
+
+
+def test_small_scales_of_view_matrices_are_no_rounding() -> None:
+    viewmats = torch.eye(4).repeat(3, 1, 1)
+    viewmats[:, :3, :3] *= torch.tensor([1.0005, 1.002, 0.998])[:, None, None]
+    scales = view_scales(viewmats)
+    assert scales[0] == 1.0
+    torch.testing.assert_close(scales[1:], torch.tensor([1.002, 0.998]))

@@ -266,3 +266,11 @@ def test_numbers_of_any_type_make_a_motion():
 def test_scenes_to_merge_may_come_from_an_iterator():
     scenes = [random_scene(2), random_scene(3)]
     assert same_bits(merge(iter(scenes)), merge(scenes))
+
+
+def test_merged_scenes_keep_their_sh_bands_and_get_zeros_above() -> None:
+    first, second = random_scene(3, degree=1), random_scene(2, degree=2)
+    both = merge([first, second])
+    assert torch.equal(both.shN[:3, :3], first.shN)
+    assert not both.shN[:3, 3:].any()
+    assert torch.equal(both.shN[3:], second.shN)

@@ -58,7 +58,7 @@ OWNERS = {
     "distributed": "outofcore/distributed.py",
     "filelock": "io/locks.py",
     "psutil": "outofcore/memory.py",
-    "viser": "viewer/server.py",
+    "viser": "viewer/connection.py",
 }
 HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "jinja2", "matplotlib", "zstandard")
 HEAVY += ("distributed",)

@@ -225,3 +225,11 @@ def test_the_command_writes_levels(scene, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         main([*words[:-1], "0.1,x"])
     assert ended.value.code == 2
+
+
+def test_boxes_of_levels_are_in_the_axes_of_their_files(tmp_path) -> None:
+    levels = Simplifier(device="cpu").levels(random_scene(60), [0.5])
+    index = write_levels(levels, tmp_path, rhos=[0.5], source="a", suffix=".glb")
+    stored = cvtgs.load(tmp_path / "rho_0.5.glb", axes="rdf").means  # the numbers in the file
+    assert list(index.levels[0].box_min) == stored.amin(dim=0).tolist()
+    assert list(index.levels[0].box_max) == stored.amax(dim=0).tolist()

@@ -16,7 +16,7 @@ import torch
 import viser_stand_in
 from cvtgs import GaussianScene, Simplifier, load, save
 from cvtgs.cli.main import main
-from cvtgs.errors import ConfigError, DeviceError, InvalidArgumentError, MissingDependencyError
+from cvtgs.errors import ConfigError, DeviceError, InvalidArgumentError
 from cvtgs.viewer import SceneViewer, ShownScene, ViewerServer, camera_of, scene_page
 from cvtgs.viewer.scenes import FULL
 from cvtgs.viewer.server import SceneNode
@@ -393,14 +393,3 @@ def test_wrong_values_are_refused_before_a_server_starts(
         ViewerServer(viewer, host="192.0.2.1")
     assert main(["view", str(tmp_path / "missing.ply"), "--preset", "nope"]) == 1
     assert "found 'nope'" in capsys.readouterr().err
-
-
-def test_a_missing_viser_is_an_error(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(MissingDependencyError, match=r'pip install "cvtgs\[view\]"'):
-        ViewerServer(SceneViewer(random_scene(3)))
-    save(random_scene(3), tmp_path / "a.ply")
-    assert main(["view", str(tmp_path / "a.ply")]) == 1
-    assert 'pip install "cvtgs[view]"' in capsys.readouterr().err

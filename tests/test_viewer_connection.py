@@ -4,12 +4,16 @@ import asyncio
 import sys
 import time
 from http import HTTPStatus
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 import viser_stand_in
+from cvtgs import save
+from cvtgs.cli.main import main
+from cvtgs.errors import MissingDependencyError
 from cvtgs.viewer import SceneViewer, ViewerServer
 from cvtgs.viewer.connection import start_server
 from scenes import random_scene
@@ -127,3 +131,14 @@ def until(said: str) -> None:
     while said not in control("markdown 0").content + control("markdown 7").content:
         assert time.monotonic() < end, said
         time.sleep(0.01)
+
+
+def test_a_missing_viser_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(MissingDependencyError, match=r'pip install "cvtgs\[view\]"'):
+        ViewerServer(SceneViewer(random_scene(3)))
+    save(random_scene(3), tmp_path / "a.ply")
+    assert main(["view", str(tmp_path / "a.ply")]) == 1
+    assert 'pip install "cvtgs[view]"' in capsys.readouterr().err

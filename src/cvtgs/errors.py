@@ -91,12 +91,12 @@ def _file_error(
     return error
 
 
-class InputNotFoundError(_FileError, FileNotFoundError):
-    """The file to read does not exist."""
-
-
 class InputError(_FileError):
-    """The file to read exists but cannot be read (a directory, no permission, a failing disk)."""
+    """The file to read cannot be read (missing, a directory, no permission, a failing disk)."""
+
+
+class InputNotFoundError(InputError, FileNotFoundError):
+    """The file to read does not exist."""
 
 
 class OutputExistsError(_FileError, FileExistsError):

@@ -83,6 +83,7 @@ def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInf
     Raises:
         InvalidSceneError: The scene has no valid row.
         InvalidArgumentError: The configuration is no SimplifyConfig.
+        InputError, FileFormatError: A path cannot be read, as for :func:`cvtgs.load`.
 
     Example:
         >>> from cvtgs.synthetic import scene

@@ -98,6 +98,7 @@ class Simplifier:
         Raises:
             InvalidArgumentError: Ratio or count is out of range, or not exactly one is given.
             InvalidSceneError: The scene has no valid row.
+            InputError, FileFormatError: A path cannot be read, as for :func:`cvtgs.load`.
         """
         prepared = self.prepare(scene, cameras=cameras)
         return prepared.run(rho, count=count, max_count=max_count, keep=keep).scene
@@ -163,6 +164,9 @@ class Simplifier:
         Returns:
             The prepared scene.
 
+        Raises:
+            InvalidArgumentError: It is neither a scene nor a path, or ``cameras`` are none.
+
         Example:
             >>> from cvtgs.synthetic import scene as make
             >>> prepared = Simplifier(device="cpu").prepare(make("object", 1000))
@@ -225,7 +229,7 @@ def simplify(
         leave fewer.
 
     Raises:
-        InputError: The file cannot be read.
+        InputError: The file is missing (:class:`cvtgs.errors.InputNotFoundError`) or unreadable.
         FileFormatError: The file violates its format.
         ConfigError: There is no such preset.
         DeviceError: The device cannot be used.

@@ -109,7 +109,7 @@ def test_info_lists_every_effect_with_its_evidence(source, capsys):
         assert " on if " in lines[name]
     assert lines["effect"].split() == ["effect", "state", "measured", "rule"]
     assert "on, to degree 2 " in lines["sh"]
-    assert "on, forced " in lines["haze"]
+    assert "on, by setting " in lines["haze"]
     assert "forced" not in lines["sh"]
 
 

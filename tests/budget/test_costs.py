@@ -6,7 +6,7 @@ import pytest
 
 from cvtgs import SimplifyConfig
 from cvtgs.budget import CostModel, Work, choose_preset, cost_model, shipped_model
-from cvtgs.budget.calibrate import TRIALS
+from cvtgs.budget.calibrate import TRIALS, Trial, calibrate
 from cvtgs.budget.costs import Measurement, fit_rates
 from cvtgs.errors import InvalidArgumentError
 
@@ -177,3 +177,34 @@ def test_no_setting_may_name_the_preset_that_a_budget_chooses():
     work = Work(count=10_000, target=100)
     with pytest.raises(InvalidArgumentError, match=r"chooses the preset.*found preset = draft"):
         choose_preset(work, 9.0, settings={"preset": "draft"}, model=shipped_model())
+
+
+def test_a_prior_rate_weighs_as_much_as_three_tenths_of_a_measurement():
+    """The least squares of one feature by hand, in units of the prior rate, 2 seconds."""
+    found = fit_rates([{"n": 1.0}, {"n": 1.0}], [2.0, 8.0], prior={"n": 2.0})["n"] / 2.0
+    shares, factor = (1.0, 0.25), 2.0  # predicted by measured seconds; their mean ratio
+    weight = 0.3 / factor**2
+    by_hand = (sum(shares) + weight * factor) / (sum(one**2 for one in shares) + weight)
+    assert found == pytest.approx(by_hand)
+
+
+@pytest.mark.parametrize(("steps", "wanted"), [(100, 3.0), (0, 5.0)])
+def test_a_limit_of_the_refinement_bounds_the_predicted_seconds(steps, wanted):
+    config = SimplifyConfig.compose(preset="matched")
+    refine = config.refine.model_copy(update={"steps": steps, "seconds": 5.0})
+    work, config = Work(count=100, target=10), config.model_copy(update={"refine": refine})
+    for once, seconds in ((3.0, wanted), (7.0, 5.0)):
+        model = CostModel(rates={"refine": {"once": once}})
+        assert model.stage_seconds(work, config)["refine"] == seconds
+
+
+def test_a_first_run_that_is_faster_than_all_later_ones_costs_no_start():
+    calls = []
+
+    def run(config, scene, count):
+        calls.append(count)
+        return {"check": 1.0 if len(calls) == 1 else 2.0}
+
+    trials = [Trial(preset="draft", kind="object", count=50, sh_degree=0, rho=0.1)]
+    model = calibrate(run, trials=trials, prior=CostModel(rates={}), clock=lambda: 0.0)
+    assert model.start == 0.0

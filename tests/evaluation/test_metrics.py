@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.ndimage import correlate1d
 
+from cvtgs.cameras import Cameras
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import (
     EvaluationSettings,
@@ -18,6 +19,7 @@ from cvtgs.evaluation import (
     psnr,
     ssim,
 )
+from cvtgs.evaluation.scorer import check_seen
 from cvtgs.losses import ssim_loss
 from cvtgs.views import automatic_views
 from scenes import random_scene
@@ -198,3 +200,17 @@ def test_options_that_do_not_fit_are_refused(options, text):
 def test_a_score_of_no_views_is_refused():
     with pytest.raises(InvalidArgumentError, match="at least one view, found none"):
         Score.of([])
+
+
+def test_gaussians_that_no_renderer_draws_are_not_seen() -> None:
+    """The camera looks at a Gaussian of opacity 0.001; the other one is behind it."""
+    tensors = {
+        "means": torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0]]),
+        "logit_opacities": torch.tensor([0.001, 0.9]).logit(),
+    }
+    scene = random_scene(2).with_tensors(tensors)
+    intrinsics = torch.tensor([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]])
+    camera = Cameras(viewmats=torch.eye(4)[None], Ks=intrinsics, width=16, height=16)
+    with pytest.raises(InvalidArgumentError, match="the cameras must see it, found nothing"):
+        check_seen(scene, camera, name="it")
+    check_seen(scene.select([0]), camera, name="it")  # if nothing is drawn, all centres count

@@ -82,6 +82,13 @@ TRANSFORMS: Mapping[str, tuple[Callable[[Any], None], str]] = {
         put("frames", 3, "w", value=0),
         " frame 3: the image size must be from 1 to 1,048,576 pixels, found 0 x 48.",
     ),
+    "half a turn": (
+        lambda document: (
+            [document.pop(key) for key in ("fl_x", "fl_y")],
+            document.update(camera_angle_x=math.pi),
+        ),
+        " 'camera_angle_x' must be an angle between 0 and pi, found 3.14",
+    ),
     "pixels": (
         lambda document: document["frames"][3].update(w=20_000, h=20_000),
         " frame 3: an image must have at most 268,435,456 pixels, found 20000 x 20000.",

@@ -1,6 +1,7 @@
 """glTF with ``KHR_gaussian_splatting``."""
 
 import base64
+import io
 import json
 import math
 import struct
@@ -13,6 +14,7 @@ import torch
 from cvtgs import GaussianScene, load, save
 from cvtgs.errors import DroppedDataWarning
 from cvtgs.io import change_axes, losses
+from cvtgs.io.gltf.write import write_glb
 from cvtgs.math.parameters import build_covariances, normalize_quats
 from format_cases import DATA, assert_as_oracle, assert_within, refusal, storable_scene
 from format_oracles import read_glb, read_spz
@@ -230,3 +232,13 @@ def test_a_linear_colour_space_is_warned_about(small: Path) -> None:
     with pytest.warns(DroppedDataWarning, match="colour space 'lin_rec709_display' as") as said:
         load(changed(small, linear))
     assert said[0].filename == __file__
+
+
+def test_colors_of_points_are_normalized_bytes() -> None:
+    file = io.BytesIO()
+    write_glb(storable_scene(3), file)
+    content = file.getvalue()
+    document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    place = document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]
+    color = document["accessors"][place]
+    assert (color["componentType"], color["type"], color["normalized"]) == (5121, "VEC4", True)

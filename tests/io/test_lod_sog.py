@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,6 +15,7 @@ from cvtgs.cli.main import main
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io import atomic_output, scene_size
 from cvtgs.io.sog import encode_sog
+from cvtgs.io.sog.write import palette
 from format_cases import refusal, storable_scene
 from scenes import same_bits
 
@@ -211,3 +213,12 @@ def test_missing_and_short_files_are_refused(stream: Path) -> None:
     assert refusal(stream) == (
         f"{path}: must have the 4 Gaussians that the stream reads from it, found 2."
     )
+
+
+def test_the_palette_splits_no_column_that_varies_by_rounding_only() -> None:
+    rng = np.random.default_rng(0)
+    rows = rng.normal(0, 1e-2, (6000, 2)).astype(np.float32)
+    rows[:, 0] = np.where(np.arange(6000) % 3 == 0, -1234.567, 987.654)
+    found = palette(rows, 256)
+    assert len(found.entries) == 256
+    assert np.abs(found.entries[found.labels, 1] - rows[:, 1]).mean() < 2e-4

@@ -11,6 +11,8 @@ import oracles
 from cvtgs import GaussianScene
 from cvtgs.devices import one_thread
 from cvtgs.mergenet import Architecture, MergeNet, Residuals, compose
+from cvtgs.mergenet.apply import compose_published
+from cvtgs.mergenet.published import PublishedResiduals
 from mergenet_cases import Case, case_of, lively_net, some_case, some_labels
 from scenes import random_scene, same_bits
 
@@ -206,3 +208,16 @@ def test_a_subset_of_cells_gets_the_same_results():
     )
     for name, values in some.items():
         torch.testing.assert_close(values, whole[name][keep])
+
+
+def test_huge_rotations_keep_the_length_of_quaternions() -> None:
+    merged, none = random_scene(1), torch.zeros(1, 3)
+    residuals = PublishedResiduals(
+        d_means=none,
+        d_log_scales=none,
+        d_rotvecs=torch.tensor([[1e20, -3e38, 0.0]]),
+        d_logit_opacities=none[:, 0],
+        d_sh=torch.zeros(1, 16, 3),
+    )
+    quats = compose_published(merged, cells=torch.tensor([0]), residuals=residuals)["quats"]
+    torch.testing.assert_close(quats.norm(dim=1), merged.quats.norm(dim=1))

@@ -1,5 +1,6 @@
 """The halo: blocks together give the same result as one piece, also where they meet."""
 
+import math
 import time
 from dataclasses import replace
 
@@ -20,6 +21,7 @@ from cvtgs.outofcore import simplify_file
 from cvtgs.outofcore.halo import Balls, OtherBlock, assign_points, bounding_box, halo_cells
 from cvtgs.outofcore.merge import read_cells
 from cvtgs.outofcore.rows import read_rows
+from cvtgs.outofcore.scan import partition_space
 from cvtgs.pipeline import shape_merged
 from cvtgs.tags import ANTIALIASED
 from cvtgs.views import automatic_views
@@ -365,3 +367,11 @@ def test_a_ratio_of_one_keeps_every_gaussian_unchanged_in_blocks(tmp_path, degre
         torch.cat([s.means, s.log_scales, s.sh.flatten(1)], dim=1) for s in (scene, small)
     )
     assert set(map(tuple, first.tolist())) == set(map(tuple, second.tolist()))
+
+
+def test_neighbouring_floats_lie_on_both_sides_of_a_plane():
+    """Their mean rounds to the smaller one, and only points below the plane go left."""
+    points = torch.zeros(2, 3, dtype=torch.float64)
+    points[:, 0] = torch.tensor([1.0, math.nextafter(1.0, 2.0)], dtype=torch.float64)
+    partition = partition_space(points, torch.ones(2, dtype=torch.float64), 2)
+    assert partition.blocks_of(points).tolist() == [0, 1]

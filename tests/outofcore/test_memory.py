@@ -227,3 +227,16 @@ def test_blocks_need_the_least_memory(tmp_path: Path) -> None:
             InvalidArgumentError, match=f"number of bytes, at least {LEAST_BYTES:,}; f"
         ):
             simplify_file(tmp_path / "a.ply", tmp_path / "b.ply", 0.1, memory=wrong, blocks=2)
+
+
+def test_reclaimable_pages_give_no_room_above_the_limit(tmp_path):
+    """The statistics are read after the use, so they may name more than was used."""
+    for name, text in {
+        "proc/self/cgroup": "0::/\n",
+        "sys/fs/cgroup/memory.max": "1000",
+        "sys/fs/cgroup/memory.current": "200",
+        "sys/fs/cgroup/memory.stat": "inactive_file 300\n",
+    }.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    assert control_group_rooms(tmp_path) == [1000]

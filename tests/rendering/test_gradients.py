@@ -7,7 +7,7 @@ import torch
 
 import cvtgs.synthetic
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.rendering import render
+from cvtgs.rendering import projection, render
 from render_cases import BACKENDS, MIP, backends
 from scenes import random_scene
 
@@ -152,3 +152,11 @@ def test_gradients_of_cameras_add_up(backend):
 
     alone = [gradient(TWO.select(torch.tensor([row]))) for row in range(2)]
     torch.testing.assert_close(gradient(TWO), alone[0] + alone[1])
+
+
+def test_needles_that_vanish_when_compensated_have_finite_gradients() -> None:
+    axes = torch.tensor([[[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]], requires_grad=True)
+    survival = vars(projection)["_ellipses"](axes, 0.3)[1]
+    (gradient,) = torch.autograd.grad(survival.sum(), axes)
+    assert 0.0 < survival.item() < 1 / 255
+    assert not gradient.any()

@@ -10,16 +10,18 @@ import pytest
 import torch
 
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
+from cvtgs.math.frames import robust_frame
 from cvtgs.streams import (
     StreamPlan,
     blocks,
     plan_stream,
     sog,
     stream_file,
+    tiles,
     write_sog_stream,
     write_tiles,
 )
-from cvtgs.streams.plan import plan_part
+from cvtgs.streams.plan import near_rows, plan_part
 from scenes import random_scene
 
 
@@ -176,3 +178,18 @@ def test_a_distance_that_is_no_number_from_0_is_refused(radii: Any, tmp_path: Pa
         plan_stream([level([0, 1], None), level([0], None)], environment_radii=radii)
     with pytest.raises(InvalidArgumentError, match=wanted):
         stream_file("none.ply", tmp_path, [0.5], kind="sog", environment_radii=radii)
+
+
+def test_the_nearest_gaussian_is_never_in_the_environment() -> None:
+    scene = random_scene(20)
+    frame = robust_frame(scene.means)
+    near = near_rows(scene, frame, 0.0)
+    assert near.nonzero()[:, 0].tolist() == [int(frame.distances(scene.means).argmin())]
+
+
+def test_a_tile_above_blocks_has_an_error_of_its_diagonal_at_least() -> None:
+    """So a viewer that is inside its box always loads the blocks."""
+    for error, wanted in ((1.0, 5.0), (7.0, 7.0)):
+        corners = (0.0, 0.0, 0.0), (3.0, 4.0, 0.0)
+        found = vars(tiles)["_parent"](*corners, [{"geometricError": error}])
+        assert found["geometricError"] == wanted

@@ -124,3 +124,16 @@ def test_a_search_for_a_count_uses_the_cameras_beside_a_file(tmp_path, scene):
         tmp_path / "scene.ply", psnr=1.0, simplifier=simplifier, heldout=few
     )
     assert found.report.views == "8 cameras"
+
+
+def test_a_test_split_of_all_cameras_is_none(tmp_path, scene):
+    """Nothing would be left to fit a scene to."""
+    cvtgs.save(scene, tmp_path / "scene.ply")
+    path = tmp_path / "transforms.json"
+    write_transforms(path, automatic_views(scene, 5, width=64, height=48))
+    document = json.loads(path.read_text())
+    names = [frame["file_path"] for frame in document["frames"]]
+    for count, is_found in ((5, False), (4, True)):
+        path.write_text(json.dumps({**document, "test_filenames": names[:count]}))
+        own = find_own_cameras(scene, tmp_path / "scene.ply")
+        assert (own.test_cameras() is not None) == is_found

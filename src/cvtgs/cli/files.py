@@ -273,7 +273,7 @@ def _effect_cells(effect: "Effect") -> tuple[str, str, str]:
     if isinstance(effect, BandsEffect) and effect.bands:
         state += f", to degree {effect.degree}" if effect.active else ""
         figures = ", ".join(f"{loss:.3g}" for loss in effect.bands)
-    return state + (", forced" if effect.forced else ""), figures, effect.meaning
+    return state + (", by setting" if effect.forced else ""), figures, effect.meaning
 
 
 def _vector(values: tuple[float, ...]) -> str:

@@ -150,8 +150,8 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     "--views": {
         "metavar": "N",
         "type": int,
-        "help": "number of views; with --cameras, N of them, spread evenly (default 8, or all of "
-        "--cameras)",
+        "help": "number of views, spread evenly over those of --cameras or found beside the scene "
+        "(default 8, or all of --cameras)",
     },
     "--background": {
         "metavar": "COLOR",
@@ -216,7 +216,9 @@ class CommandParser(argparse.ArgumentParser):
             for word in takewhile(lambda word: word != "--", args or ()):
                 name = word.partition("=")[0]
                 if name.startswith("--") and not any(one.startswith(name) for one in options):
-                    self.error(f"unrecognized argument: {name}{suggestion(name, options)}")
+                    self.error(
+                        f"unrecognized argument: {name}{suggestion(name, options, likeness=0.7)}"
+                    )
                 if f"-{name}" in options:  # else -output means -o utput
                     self.error(f"unrecognized argument: {name}; did you mean -{name}?")
         known, rest = super().parse_known_args(args, namespace)

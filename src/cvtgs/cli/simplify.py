@@ -81,9 +81,9 @@ def add_simplify(add_parser: AddParser) -> None:
         "--target-psnr",
         type=float,
         metavar="DB",
-        help="PSNR that OUT is to reach with as few Gaussians as possible, over --cameras or the "
-        "automatic views of cvtgs evaluate; for presets that use images, over other automatic "
-        "views; every try is written and read, which takes long for .sog",
+        help="PSNR (at most 60) that OUT is to reach with as few Gaussians as possible, over "
+        "--cameras or the automatic views of cvtgs evaluate; for presets that use images, over "
+        "other automatic views; every try is written and read, which takes long for .sog",
     )
     size.add_argument(
         "--target-ssim",

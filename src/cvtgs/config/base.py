@@ -1,5 +1,6 @@
 """Shared by configurations and reports: strict models, TOML reading, error texts."""
 
+import os
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any, ClassVar
 
 import pydantic
 
-from cvtgs.errors import ConfigError
+from cvtgs.errors import ConfigError, check_path
 from cvtgs.text import SETTING_LIKENESS, shortened, shown, suggestion
 
 MOST_PROBLEMS = 4  # maximum number of problems that one error message names
@@ -55,7 +56,7 @@ class Section(pydantic.BaseModel):
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
 
-def read_toml(path: Path) -> dict[str, Any]:
+def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read a TOML file; a byte order mark, as editors on Windows write it, is skipped.
 
     Args:
@@ -66,9 +67,11 @@ def read_toml(path: Path) -> dict[str, Any]:
 
     Raises:
         ConfigError: The file cannot be read, or is not TOML.
+        InvalidArgumentError: ``path`` is no path.
     """
+    check_path(path)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}.") from None
     except RecursionError:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.boxes import Corner
-from cvtgs.counts import whole_number
+from cvtgs.counts import real_number, whole_number
 from cvtgs.cvt import nearest_site
 from cvtgs.devices import on_host
 from cvtgs.errors import InvalidArgumentError
@@ -183,7 +183,7 @@ def plan_stream(
 
 def check_environment(radii: float | None) -> None:
     """Check the distance at which the environment begins, in robust radii; None for none."""
-    if radii is not None and not (isinstance(radii, int | float) and radii >= 0):
+    if radii is not None and not real_number(radii) >= 0:
         raise InvalidArgumentError(
             f"the environment must begin at a number of radii, at least 0, found {shown(radii)}."
         )

@@ -354,6 +354,11 @@ def open_rows(
         check_degree(sh_degree)
     name = os.fspath(path)
     with open_input(Path(path)) as file:
+        if file.read(3) != b"ply":
+            raise FileFormatError(
+                f"{name}: only PLY files can be read in parts; write one with cvtgs convert."
+            )
+        file.seek(0)
         header = read_header(file, name)
         size = os.fstat(file.fileno()).st_size
     vertex = find_vertices(header, name)
