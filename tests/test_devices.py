@@ -244,7 +244,7 @@ def test_threads_are_left_to_chunks(two_threads):
         assert set(in_threads(threads, range(4), HOST)) == {(threading.get_ident(), 1)}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("policy", ["ACTIVE", "PASSIVE"])
 @pytest.mark.parametrize("preset", ["draft", "standard", "paper", "matched", "high"])
 def test_results_do_not_depend_on_the_number_of_threads(two_threads, monkeypatch, preset, policy):

@@ -48,7 +48,7 @@ OLD_PROCESSOR = {"ATEN_CPU_CAPABILITY": "default", "MKL_CBWR": "COMPATIBLE"}
 """Variables that make torch and MKL compute as on a processor without vector instructions."""
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_another_processor_gives_nearly_the_same():
     """Generated scenes are the same up to rounding, so tests do not depend on the machine."""
     kinds = list(digests.KINDS)

@@ -74,7 +74,7 @@ def test_simplify(tmp_path: Path) -> None:
     assert "tessellate is done" in printed
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_compare(tmp_path: Path) -> None:
     source, page = scene_file(tmp_path / "scene.ply"), tmp_path / "page"
     words = ("--rho", 0.1, "--presets", "draft,fast", "--size", 64)
@@ -114,7 +114,7 @@ def test_train_tiny(tmp_path: Path) -> None:
     assert "300 -> 30 Gaussians" in printed
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_gsplat_loop() -> None:
     printed = run("gsplat_loop.py", "--count", 500, "--steps", 11, "--size", 48)
     losses = [float(line.split()[-1]) for line in printed.splitlines()]

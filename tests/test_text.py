@@ -131,7 +131,7 @@ def run(encoding: str, *words: str | bytes) -> subprocess.CompletedProcess[bytes
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
 def test_consoles_with_other_encodings_work(tmp_path: Path, encoding: str) -> None:
     path = tmp_path / "caf\u00e9 \u4e2d.ply"

@@ -32,7 +32,7 @@ def test_an_embedding_program_passes_mypy(folder: Path) -> None:
     assert done.returncode == 0, done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_wrong_calls_are_found(folder: Path) -> None:
     """The check can fail: three mistakes give three errors."""
     program = folder / "wrong.py"

@@ -56,7 +56,7 @@ def result(psnr: float, *, seconds: float = 2.0, lpips: float | None = None, cou
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_methods_and_a_tool_are_run_judged_and_reported(file, tmp_path, capsys):
     (tmp_path / "first_rows.py").write_text(COPY)
     tool = f"copy={sys.executable} {tmp_path / 'first_rows.py'} {{IN}} {{OUT}} {{COUNT}} 1"
@@ -101,7 +101,7 @@ def test_the_table_has_the_scores_of_the_baseline(file, capsys, background):
     assert f"pixels where none are beside a scene, over {background}. " in text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_failing_tool_does_not_stop_the_others(file, tmp_path, capsys):
     broken = f"broken={sys.executable} -c raise({{COUNT}}) {{IN}} {{OUT}}"
     silent = f"silent={sys.executable} -c pass {{IN}} {{OUT}}"
@@ -116,7 +116,7 @@ def test_a_failing_tool_does_not_stop_the_others(file, tmp_path, capsys):
     assert "Failed:\n\n- broken, thing, 0.1\n- silent, thing, 0.1\n- missing, thing, 0.1" in text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_another_judge_and_lpips(file, tmp_path, capsys):
     torch.save(dict(lpips_cases.random_state("alex")), tmp_path / "weights.pth")
     weights = str(tmp_path / "weights.pth")
@@ -210,7 +210,7 @@ def test_results_are_joined_and_read_back_from_their_file(tmp_path):
     assert compare_tables.read_results(tmp_path / "none.json") == {}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_kept_files_are_not_made_again_and_results_accumulate(file, tmp_path, capsys):
     (tmp_path / "first_rows.py").write_text(COPY)
     common = [str(file), "--rho", "0.05", "--results", str(tmp_path / "results.json")]
@@ -242,6 +242,7 @@ def test_the_plot_omits_what_failed_on_a_scene(monkeypatch):
     assert compare_tables.chart({"a": {"z": {0.1: None}}}, [0.1]) is None
 
 
+@pytest.mark.long
 def test_photographs_judge_instead_of_the_full_scene(file, tmp_path, capsys):
     """The photographs are images of the copy that the tool makes, which is nearly perfect."""
     full = cvtgs.load(file)

@@ -205,7 +205,7 @@ def test_a_target_is_searched_and_reported(source, capsys, shown):
     assert "tessellate" not in shown
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_target_is_measured_over_the_views_of_evaluate(source, capsys):
     simplified(source, "--target-psnr", "15")
     found = re.search(r"PSNR ([\d.]+) dB, SSIM ([\d.]+)", capsys.readouterr().out)

@@ -118,7 +118,7 @@ def test_another_aspect_ratio_is_refused_in_one_sentence(folder, scenes, tmp_pat
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_tradeoff_against_photographs(folder, scenes, tmp_path, capsys):
     words = ["--cameras", str(folder), "--images", str(folder), "--views", "2", "--lpips", "off"]
     words += ["--presets", "draft", "--rho", "0.1", "-o", str(tmp_path)]
@@ -218,7 +218,7 @@ def test_compare_writes_page_sheet_and_maps(scenes, tmp_path, capsys):
     assert main([*words, "--overwrite"]) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_evaluate_and_compare_print_the_same_scores(folder, scenes, tmp_path, capsys):
     for number, words in enumerate(([], ["--cameras", str(folder / "transforms.json")])):
         words = [*scenes, *words, "--lpips", "off"]  # noqa: PLW2901

@@ -297,7 +297,7 @@ def test_standard_input_without_a_scene_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_commands_work_in_a_pipe(scenes: Path) -> None:
     program = f"{sys.executable} -m cvtgs"
     line = f"cat a.ply | {program} simplify - - --rho 10% | {program} convert - z.splat"

@@ -176,7 +176,7 @@ def test_columns_that_a_merge_leaves_out_are_listed_as_lost(capsys, source):
     assert "Lost: columns that not all scenes have (heat, id)." in text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("count", "text"),
     [

@@ -18,7 +18,7 @@ def source(tmp_path) -> Path:
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_table_is_printed_and_the_files_are_written(source, tmp_path, capsys):
     pytest.importorskip("matplotlib")
     words = ["tradeoff", str(source), "--presets", "draft,standard", "--rho", "0.1", *LOOK]

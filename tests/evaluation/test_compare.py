@@ -307,7 +307,7 @@ def test_captions_are_those_of_the_shown_views(comparison):
     assert row.captions == [f"{views[2]:.2f} dB", f"{views[0]:.2f} dB"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_sheets_hold_every_image(comparison):
     sheet, errors = contact_sheet(comparison), error_sheet(comparison)
     full, tenth = comparison.full.alphas[2], comparison.small["0.1"].alphas[2]

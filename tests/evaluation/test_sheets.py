@@ -34,6 +34,7 @@ def gray_comparison(views: int, *, width: int, height: int) -> Comparison:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("views", "width"), [(1, 32), (1, 640), (2, 640), (8, 640)])
 def test_the_legends_of_error_maps_are_whole(views, width):
     errors = error_sheet(gray_comparison(views, width=width, height=480))

@@ -114,7 +114,7 @@ LYING = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @linux
 def test_false_headers_take_no_memory_and_hangs_are_found(tmp_path):
     for name, data in LYING.items():

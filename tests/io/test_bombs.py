@@ -232,20 +232,21 @@ def test_spz_that_many_nodes_repeat_counts_as_often(
     )
 
 
-def test_files_that_a_stream_repeats_count_once(tmp_path: Path) -> None:
-    """They are read up to the one with which the scene gets too large."""
+def test_files_of_a_stream_are_read_up_to_the_one_that_is_too_much(tmp_path: Path) -> None:
     count, path = FULLEST // 2, tmp_path / "lod-meta.json"
-    sog(tmp_path / "a.sog", count)
+    for number in range(9):
+        sog(tmp_path / f"{number}.sog", count)
     leaves = [{"lods": {"0": {"file": file, "offset": 0, "count": count}}} for file in range(9)]
-    names = {"filenames": ["a.sog"] * 9, "lodLevels": 1, "tree": {"children": leaves}}
+    files = [f"{number}.sog" for number in range(9)]
+    names = {"filenames": files, "lodLevels": 1, "tree": {"children": leaves}}
     path.write_text(json.dumps(names))
-    size = (tmp_path / "a.sog").stat().st_size
+    size = sum((tmp_path / name).stat().st_size for name in files)
     assert refusal(path) == (
         f"{path}: a scene must take at most 64 MiB plus {MOST_EXPANSION} times the bytes of its "
         f"file, found {3 * count:,} Gaussians that take {3 * count * 56:,} bytes in a file of "
         f"{size:,}; if you trust the file, pass trust_sizes=True (--trust-sizes)."
     )
-    names |= {"filenames": ["a.sog"] * 2, "tree": {"children": leaves[:2]}}
+    names |= {"filenames": files[:2], "tree": {"children": leaves[:2]}}
     path.write_text(json.dumps(names))
     assert len(cvtgs.load(path)) == 2 * count
 

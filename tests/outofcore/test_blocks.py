@@ -363,7 +363,7 @@ def test_less_memory_makes_more_blocks(source):
     assert more > few > 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_cuts_the_scene_if_memory_is_low(source, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("cvtgs.outofcore.memory.BASE_BYTES", 10)
     monkeypatch.setattr("cvtgs.outofcore.memory.LEAST_BYTES", 20)

@@ -60,7 +60,7 @@ def test_effects_switched_off_leave_the_columns_of_one_piece(scene, tmp_path, na
     assert not wanted.shN[:, 3:].any()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_source_and_output_axes_are_applied_in_blocks(scene, tmp_path):
     wanted, _ = in_blocks(tmp_path, scene, "wanted.ply", boxes=[BOX])
     found, report = in_blocks(
@@ -76,7 +76,7 @@ def test_source_and_output_axes_are_applied_in_blocks(scene, tmp_path):
     torch.testing.assert_close(turned.means, cvtgs.load(wanted).means, atol=1e-3, rtol=0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_passes_axes_and_degree_to_blocks(scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("cvtgs.outofcore.memory.BASE_BYTES", 10)
     monkeypatch.setattr("cvtgs.outofcore.memory.LEAST_BYTES", 20)

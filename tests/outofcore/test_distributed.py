@@ -61,7 +61,7 @@ def test_a_killed_worker_does_not_change_the_output(cluster, source, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["alone.ply", "together.ply"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore")
 def test_the_command_simplifies_on_a_cluster(cluster, source, tmp_path):
     words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.01", "--quiet"]

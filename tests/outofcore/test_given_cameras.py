@@ -66,7 +66,7 @@ def test_cameras_that_miss_the_scene_are_refused(source, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("settings", [MATCHED, REFINED])
 def test_given_cameras_decide_what_blocks_look_like(scene, source, tmp_path, settings):
     """The cameras stand on one side; from there, their result is nearer to the scene."""
@@ -92,7 +92,7 @@ def test_contributions_are_measured_with_given_cameras(scene, tmp_path):
     assert found["pixels"] == pytest.approx(float(pixels), rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_blocks_have_more_cells_where_images_err_only_with_given_cameras(scene, source, tmp_path):
     errors, files = {}, {}
     for power in (0.0, 1.0):
@@ -293,7 +293,7 @@ def two_blocks(monkeypatch):
     monkeypatch.setattr("cvtgs.outofcore.memory.block_count", lambda rows, memory, merging: BLOCKS)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("two_blocks")
 @pytest.mark.parametrize("is_given", [True, False])
 def test_cameras_of_a_capture_are_used_in_blocks(capsys, tmp_path, scene, is_given):

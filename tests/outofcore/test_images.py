@@ -101,7 +101,7 @@ def test_matching_adds_little_to_the_loss_from_blocks(scores):
     assert losses["matched"] < losses["standard"] + 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("settings", [MATCHED, REFINED])
 def test_the_order_of_blocks_does_not_matter(source, tmp_path, settings):
     def backwards(function, items):
@@ -157,7 +157,7 @@ def test_two_workers_give_the_same_bits(source, tmp_path):
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_refinement_in_blocks_gains_and_keeps_protected_gaussians(scene, source, tmp_path):
     lowest = float(scene.means[:, 2].kthvalue(len(scene) - 40).values)
     box = Box(min=(-99, -99, lowest), max=(99, 99, 99))

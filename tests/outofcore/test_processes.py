@@ -159,6 +159,7 @@ def test_windows_gets_no_more_processes_than_a_pool_has_there(monkeypatch):
     assert (worker_count(2**60, 100), pools) == (61, [61])
 
 
+@pytest.mark.long
 def test_workers_of_the_command_share_the_memory(source, tmp_path, monkeypatch, capsys):
     plans = []
     true = cvtgs.outofcore.simplify_file

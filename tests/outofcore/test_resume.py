@@ -53,7 +53,7 @@ def kill_when(process, found):
     return False
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
 def test_a_killed_run_continues_with_the_missing_blocks(source, tmp_path):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"

@@ -155,7 +155,7 @@ def test_antialiased_scenes_are_rendered_antialiased():
     assert untagged.report.psnr_before != tagged.report.psnr_before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("other", [torch.float32, torch.float64])
 def test_float64_stays_float64(other):
     full = full_scene(200)
@@ -230,7 +230,7 @@ def test_an_empty_background_stays_nearly_empty():
     assert max(errors) < 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_random_backgrounds_take_black_paint_from_an_empty_background(monkeypatch):
     """Over black alone, black opaque Gaussians cost nothing."""
     full, small, refined = refined_beside_nothing(stray=20)

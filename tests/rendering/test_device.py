@@ -93,7 +93,7 @@ def test_presets_that_refine(dtype):
         torch.testing.assert_close(found.tensors()[name], tensor, **REFINED[dtype])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("_torch_only")
 @dtypes
 def test_the_preset_that_matches(dtype):

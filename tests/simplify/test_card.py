@@ -94,7 +94,7 @@ def test_refinement_gains():
     assert refined.report.gain > 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_errors_in_given_cameras_count_on_the_device():
     scene = made(300)
     cameras = automatic_views(scene, 4, width=32, height=24)

@@ -192,7 +192,7 @@ for preset in ("standard", "paper"):
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_other_processes_give_the_same_bits():
     here = os.path.dirname(__file__)  # noqa: PTH120 (an entry of a search path)
     found = []

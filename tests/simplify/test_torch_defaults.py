@@ -118,7 +118,7 @@ def streamed(scene, folder):
     yield cvtgs.load(folder / "sog" / "lod-meta.json")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("setting", [another_device, autocast])
 @pytest.mark.parametrize("work", [in_blocks, streamed])
 def test_files_in_parts(scene, tmp_path, work, setting):

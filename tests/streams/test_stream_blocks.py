@@ -94,7 +94,7 @@ def test_parts_of_3d_tiles_share_a_root_without_content(tmp_path: Path, source: 
     assert sum(finest) == 4000 == report.levels[0].gaussians
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_workers_give_the_same_bytes(tmp_path: Path, source: Path) -> None:
     stream(source, tmp_path / "alone")
     with LocalWorkers(2) as workers:

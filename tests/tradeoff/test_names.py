@@ -45,7 +45,7 @@ def test_names_may_begin_with_a_dash(tmp_path, scene, monkeypatch):
     assert (run.path, run.report.output_count) == (Path("-out/draft_0.1.ply"), 30)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
 def test_a_name_that_is_not_utf8_is_escaped(tmp_path, scene):
     file = tmp_path / "in\udcff.ply"

@@ -58,7 +58,7 @@ def test_the_first_case_of_a_step_does_not_depend_on_their_number(scenes, cache)
     assert (len(one), len(two)) == (1, 2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_processes_compute_what_one_does(scenes, cache, monkeypatch):
     config = config_of(scenes, cases_per_step=2)
     alone = results_of(config, cache)

@@ -145,7 +145,7 @@ def test_a_step_respects_the_limit_of_members(monkeypatch, members, drawn):
     assert cells >= 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_training_run_gains_resumes_and_records_its_kind(tmp_path, monkeypatch):
     monkeypatch.setattr(History, "curves", lambda history: b"an image")
     scenes = write_scenes(tmp_path / "scenes", ["lesson", "exam", "lesson2"], 1500)

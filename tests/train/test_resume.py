@@ -70,7 +70,7 @@ def assert_same_files(first: Path, second: Path) -> None:
     assert ours.curves.read_bytes() == theirs.curves.read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("_quick_curves")
 @pytest.mark.parametrize("kind", ["scene", "local"])
 @pytest.mark.parametrize("stops", [[1], [2], [1, 3, 4, 5]], ids=str)
@@ -226,6 +226,7 @@ def test_the_curves_cover_the_whole_training(scenes, cache, tmp_path):
     assert_same_files(cut, whole)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_quick_curves")
 @pytest.mark.slow
 def test_the_checkpoint_of_another_training_is_refused(scenes, cache, tmp_path):

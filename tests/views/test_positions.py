@@ -152,6 +152,7 @@ def cut_room(*, convention: str = "y-down", wall: bool = False) -> cvtgs.Gaussia
     return room[(down > 0.1) & ((across < 0.9) | wall)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_a_room_open_to_a_side_is_viewed_from_there_or_from_inside(convention, monkeypatch):
     scene = cut_room(convention=convention)
