@@ -204,7 +204,11 @@ def _parsed_rows(file: BinaryIO, header: Header, vertex: Element, path: str) -> 
         ) from error
     needed = header.elements[: header.elements.index(vertex) + 1]
     try:
-        with _CleanStream(file, header, needed) as stream, _no_warnings(header, needed):
+        with (
+            _CleanStream(file, header, needed) as stream,
+            _no_warnings(header, needed),
+            np.errstate(all="ignore"),  # numbers beyond a type become infinite
+        ):
             data = PlyData.read(stream)[f"e{len(needed) - 1}"].data
     except PlyElementParseError as error:
         raise FileFormatError(_explain(error, needed, path)) from error
