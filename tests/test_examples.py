@@ -35,7 +35,7 @@ def scene_file(path: Path, count: int = 400) -> Path:
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_gsplat_checkpoint(tmp_path: Path) -> None:
     source, small = tmp_path / "ckpt_29999_rank0.pt", tmp_path / "small.pt"
     scene = cvtgs.synthetic.scene("object", 400, sh_degree=2, seed=0)
@@ -47,7 +47,7 @@ def test_gsplat_checkpoint(tmp_path: Path) -> None:
     assert len(cvtgs.load(small)) == 40
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nerfstudio_run(tmp_path: Path) -> None:
     (tmp_path / "run" / "nerfstudio_models").mkdir(parents=True)
     scene = cvtgs.synthetic.scene("object", 400, sh_degree=1, seed=0)
@@ -56,7 +56,7 @@ def test_nerfstudio_run(tmp_path: Path) -> None:
     assert len(cvtgs.load(tmp_path / "small.spz")) == 40
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_inria_model(tmp_path: Path) -> None:
     model, small = inria_model(tmp_path / "model"), tmp_path / "small"
     run("inria_model.py", model, small, "--rho", "0.5")

@@ -276,7 +276,7 @@ def test_count_report_and_determinism(scene):
     assert float(small.opacities.amax()) <= 1 - 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_refinement_reuses_the_images_of_the_matching(scene, monkeypatch):
     """The full scene is rendered once for all steps; larger images are rendered anew."""
     steps = {"size": 48, "stride": 2, "steps": 9, "steps_per_image": 20, "check_every": 3}

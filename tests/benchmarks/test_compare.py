@@ -80,7 +80,7 @@ def test_methods_and_a_tool_are_run_judged_and_reported(file, tmp_path, capsys):
     assert (out / "compare.png").read_bytes()[1:4] == b"PNG"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("background", ["black", "white"])
 def test_the_table_has_the_scores_of_the_baseline(file, capsys, background):
     arguments = [str(file), "--rho", "0.1", "--methods", "mass pruning"]

@@ -72,7 +72,7 @@ def test_the_first_scene_has_touching_balls(dataset):
     assert len(drawn) == 50
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_training_learns_what_test_pictures_show(dataset):
     train, test = (read_split(dataset, split, SIZE) for split in ("train", "test"))
     first = first_scene(train[0], 400, points=None, seed=0)

@@ -37,6 +37,7 @@ def test_workers_are_compared(tmp_path, monkeypatch, capsys):
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("has_cameras", [True, False])
 def test_seams_are_scored_by_the_cameras_beside_a_file(tmp_path, monkeypatch, capsys, has_cameras):
     """And the others, six of which are given, score nothing."""

@@ -303,7 +303,7 @@ def test_a_closed_pipe_exits_with_141_and_no_message(tmp_path, words):
     assert (done.returncode, done.stderr) == (141, "")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="closes streams as POSIX shells do")
 def test_streams_that_the_parent_closed(tmp_path):
     cvtgs.save(cvtgs.synthetic.scene("object", 200, sh_degree=0, seed=0), tmp_path / "a.ply")

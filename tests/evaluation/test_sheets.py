@@ -45,6 +45,7 @@ def test_the_legends_of_error_maps_are_whole(views, width):
     assert off.min() <= 1, "rounding"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("views", [40, 400])
 def test_images_of_many_views_are_as_wide_as_their_columns(views):
     sheet = contact_sheet(gray_comparison(views, width=640, height=480))

@@ -78,7 +78,7 @@ def test_a_cell_of_a_million_members_is_merged_accurately():
     assert_standard(small.select(torch.tensor([0])))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_scene_with_one_huge_cell_is_simplified():
     scene = CASES["crowd_beside_loners"](1_000_000, torch.float32)
     scene = scene.with_tensors({"shN": scene.shN[:, :0]}, {})

@@ -29,7 +29,7 @@ def in_blocks(folder, scene, name="out.ply", *, axes=None, **options):
     return folder / name, report
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_dropped_sh_bands_give_the_bytes_of_a_scene_without_them(scene, tmp_path):
     wanted, _ = in_blocks(tmp_path, scene.with_sh_degree(1), "wanted.ply", boxes=[BOX])
     found, report = in_blocks(tmp_path, scene, "found.ply", boxes=[BOX], sh_degree=1)

@@ -235,6 +235,7 @@ def two_objects(scene, tmp_path):
     return tmp_path / "in.ply"
 
 
+@pytest.mark.long
 def test_a_block_that_no_camera_shows_stays_as_it_is(two_objects, tmp_path):
     """The cameras look at the first object only."""
     unmatched = MATCHED | {"match": {"opacity_rounds": 0, "color_iterations": 0}}

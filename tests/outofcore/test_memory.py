@@ -149,6 +149,7 @@ def test_the_least_memory_is_accepted_and_less_is_refused() -> None:
         read_bytes(f"{least - 1}MB")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("build", "least"), [(None, 400), ("13.0", 550)])
 def test_the_build_of_torch_counts(build: str | None, least: int) -> None:
     program = (

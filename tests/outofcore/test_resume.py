@@ -98,7 +98,7 @@ def test_a_run_killed_between_steps_of_all_blocks_continues(source, tmp_path, st
     assert output.read_bytes() == whole.read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
 def test_a_run_killed_before_all_rows_were_sorted_starts_over(source, tmp_path):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
@@ -120,7 +120,7 @@ def stop_in_blocks(event):
         raise StoppedError
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "change", ["rho", "blocks", "file", "config", "manifest", "scan", "rows", "size"]
 )
@@ -194,7 +194,7 @@ def test_everything_that_a_result_depends_on_changes_the_key_of_a_job(tmp_path, 
     assert len(keys) == len(others) + 6
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("is_gone", [True, False])
 def test_a_damaged_network_is_written_again(source, tmp_path, is_gone):
     output, whole = tmp_path / "out.ply", tmp_path / "whole.ply"

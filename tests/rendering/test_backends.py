@@ -98,7 +98,7 @@ def test_without_memory_for_numba_no_other_backend_is_chosen():
     assert lines == ["no memory"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_kernels_work_without_a_folder_for_compiled_code():
     pytest.importorskip("numba")
     lines = python(
@@ -110,7 +110,7 @@ def test_kernels_work_without_a_folder_for_compiled_code():
     assert lines == ["3"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_threads_of_torch_and_numba_stay_as_they_are(monkeypatch):
     pytest.importorskip("numba")
     monkeypatch.setenv("NUMBA_NUM_THREADS", "2")

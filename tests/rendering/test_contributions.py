@@ -202,7 +202,7 @@ def test_every_preset_gives_the_exact_count(name):
     assert report.checkpoint == ("none" if name in ("draft", "fast") else "standard")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @backends
 def test_painting_a_scene_s_own_colours_gives_its_image(backend):
     scene = random_scene(60, degree=0, dtype=torch.float64)

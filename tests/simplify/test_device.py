@@ -156,6 +156,7 @@ def test_short_chunks_are_used_where_long_ones_do_not_fit(monkeypatch, computed_
         assert Simplifier(device="cuda").run(scene.to("cuda"), 0.02).report.device_note == ""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("preset", ["standard", "paper"])
 @pytest.mark.slow
 def test_levels_on_a_device(preset, computed_as_on_the_cpu):
@@ -272,7 +273,7 @@ def test_the_pretended_device_refuses_and_counts():
         there + 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_prepared_scene_runs_again_on_a_device():
     scene = random_scene(300)
     wanted = Simplifier(device="cpu").prepare(scene)

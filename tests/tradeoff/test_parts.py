@@ -322,7 +322,7 @@ def test_the_size_of_a_folder_is_that_of_its_scene(tmp_path, monkeypatch):
     assert found.tradeoff.source_bytes == file.stat().st_size
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are those of POSIX")
 @pytest.mark.parametrize("number", ["SIGINT", "SIGKILL"])
 def test_the_child_process_ends_with_its_parent(tmp_path, number):

@@ -92,7 +92,7 @@ def test_a_step_follows_the_mean_gradient(scenes, cache, tmp_path, monkeypatch):
         torch.testing.assert_close(gradient, (one + other) / 2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_resumed_training_of_several_cases_gives_the_same_bits(scenes, cache, tmp_path):
     config = config_of(scenes, cases_per_step=3, steps=4)
     run(config, tmp_path / "whole.safetensors", cache)

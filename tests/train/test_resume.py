@@ -214,7 +214,7 @@ def test_another_configuration_or_a_damaged_state_is_one_clear_error(scenes, cac
     assert path.read_bytes() == checkpoint
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @needs_matplotlib
 def test_the_curves_cover_the_whole_training(scenes, cache, tmp_path):
     whole, cut = tmp_path / "whole.safetensors", tmp_path / "cut.safetensors"

@@ -85,7 +85,7 @@ def test_people_in_an_open_place_stand_on_its_ground(kind, floor, monkeypatch):
     assert views.Ks[0, 0, 0].item() == pytest.approx(50.0 / math.tan(math.radians(30.0)))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["object", "courtyard"])
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_no_view_is_beneath_the_floor(kind, convention):

@@ -339,7 +339,7 @@ def _unpickled(path: Path) -> Any:
 
 
 def _names_in(path: Path) -> Iterator[str]:
-    """Yield the names in the pickles of a checkpoint, and what `torch.save` never writes.
+    """Yield the names in the pickles of a checkpoint, and what ``torch.save`` never writes.
 
     That is codecs from bytes to bytes, other protocols, of which torch warns, and compression.
     ``weights_only`` blocks code, but allows ``bytearray`` and other names that take any memory.
