@@ -356,6 +356,11 @@ def concatenate(scenes: Iterable[GaussianScene]) -> GaussianScene:
 
     Raises:
         InvalidSceneError: The scenes do not fit together.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> len(concatenate([make("object", 20, seed=0), make("object", 30, seed=1)]))
+        50
     """
     scenes = checked_scenes(scenes, "joining")
     first, *others = scenes

@@ -55,6 +55,15 @@ def filter_rows(
 
     Raises:
         InvalidArgumentError: The analysis is of another scene, or ``target`` is outside 1 to n.
+
+    Example:
+        >>> from cvtgs.analysis import analyze
+        >>> from cvtgs.config import SimplifyConfig
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene, config = make("object", 100, seed=0), SimplifyConfig()
+        >>> found = filter_rows(scene, analyze(scene, config), 10, config.filter)
+        >>> len(found.rows) + found.left_out
+        100
     """
     opacities = analysis.opacities
     if len(opacities) != len(scene):

@@ -57,6 +57,12 @@ def check_rows(scene: GaussianScene) -> CheckedScene:
 
     Raises:
         InvalidSceneError: No row is valid.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> checked = check_rows(make("object", 100, seed=0))
+        >>> len(checked.scene), checked.invalid_count
+        (100, 0)
     """
     if len(scene) == 0:
         raise InvalidSceneError("a scene needs at least one Gaussian to be simplified; found none.")

@@ -89,7 +89,7 @@ def test_every_eighth_camera_by_name_is_a_test_camera(write, tmp_path) -> None:
     assert list(train.names) == [name for name in NAMES if name in train.names]
 
 
-@pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", ".", "0"])
 @pytest.mark.parametrize("write", [colmap_bin, colmap_txt])
 def test_a_colmap_model_is_found_in_every_place(write, place, tmp_path) -> None:
     write(tmp_path / place)

@@ -69,6 +69,15 @@ def merge_pairs(
 
     Raises:
         InvalidArgumentError: ``count`` is outside 1 to m, or shapes or types do not fit.
+
+    Example:
+        >>> ones, x = torch.ones(3), torch.tensor([[0.0, 0.1, 5.0], [0.0] * 3, [0.0] * 3])
+        >>> groups = Moments(
+        ...     ones, ones, ones, x, torch.full((6, 3), 1e-4), torch.zeros(3, 3), torch.zeros(0, 3)
+        ... )
+        >>> others = torch.tensor([[1, 2], [0, 2], [0, 1]])
+        >>> merge_pairs(groups, others, 2, AllocationConfig()).tolist()
+        [0, 0, 1]
     """
     count = checked_whole(count, "count", most=len(groups.masses), things="groups")
     contrast = _relative_contrast(groups.colors, neighbors)
@@ -298,6 +307,16 @@ def reassign(
 
     Returns:
         The new group of every member.
+
+    Example:
+        >>> from cvtgs.cells.moments import group_moments
+        >>> ones, x = torch.ones(5), torch.tensor([[0.0, 0.1, 0.2, 5.0, 5.1], [0.0] * 5, [0.0] * 5])
+        >>> shapes = 0.01 * torch.tensor([1.0, 0, 0, 1, 0, 1])[:, None].expand(6, 5)
+        >>> members = Moments(ones, ones, ones, x, shapes, torch.zeros(3, 5), torch.zeros(0, 5))
+        >>> labels = torch.tensor([0, 0, 1, 1, 1])
+        >>> groups, others = group_moments(members, labels, 2), torch.tensor([[1], [0]])
+        >>> reassign(members, labels, groups, others, AllocationConfig()).tolist()
+        [0, 0, 0, 1, 1]
     """
     count = len(groups.masses)
     own = torch.arange(count, device=labels.device)

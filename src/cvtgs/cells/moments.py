@@ -80,6 +80,20 @@ def gaussian_moments(
 
     Returns:
         The moments, in the order of the rows.
+
+    Example:
+        >>> from cvtgs.math.frames import robust_frame
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 100, seed=0)
+        >>> moments = gaussian_moments(
+        ...     scene,
+        ...     torch.arange(100),
+        ...     robust_frame(scene.means),
+        ...     masses=scene.masses,
+        ...     apparent_masses=scene.masses,
+        ... )
+        >>> moments.means.shape, moments.covariances.shape
+        (torch.Size([3, 100]), torch.Size([6, 100]))
     """
     count, device, center = len(rows), rows.device, frame.center.to(rows.device)
     means = torch.empty(3, count, dtype=torch.float64, device=device)
@@ -136,6 +150,13 @@ def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Mom
 
     Returns:
         Moments of the groups.
+
+    Example:
+        >>> ones, x = torch.ones(2), torch.tensor([[0.0, 2.0], [0.0, 0.0], [0.0, 0.0]])
+        >>> points = Moments(ones, ones, ones, x, torch.zeros(6, 2), x, torch.zeros(0, 2))
+        >>> pair = group_moments(points, torch.zeros(2, dtype=torch.int64), 1)
+        >>> pair.means[:, 0].tolist(), pair.covariances[0].item()
+        ([1.0, 0.0, 0.0], 1.0)
     """
     columns = [members.counts, members.masses, members.apparent_masses]
     counts, masses, apparent_masses = label_sums(columns, labels, count)

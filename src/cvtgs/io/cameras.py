@@ -155,8 +155,8 @@ def load_cameras(path: str | os.PathLike[str], *, split: Split | None = None) ->
       read from the PNG images. ``applied_transform`` is ignored: the cameras stay in the world of
       the file. Scenes exported by nerfstudio are moved and scaled relative to it, unless this was
       disabled in training.
-    - a COLMAP model in ``sparse/0``, ``sparse`` or the folder itself, binary before text, of any
-      pinhole model; the cameras are in the order of their names.
+    - a COLMAP model in ``sparse/0``, ``sparse``, the folder itself or its ``0``, binary before
+      text, of any pinhole model; the cameras are in the order of their names.
     - ``cameras.json`` of INRIA's 3DGS code.
 
     :class:`cvtgs.cameras.Cameras` have one image size. If sizes differ, the most frequent one (the
@@ -214,7 +214,7 @@ def _folder_views(folder: Path, split: Split | None) -> list[View]:
         return [view for part in chosen for view in _file_views(part, split)]
     from cvtgs.io.colmap import colmap_views, is_colmap  # noqa: PLC0415 (when it is read)
 
-    for model in (folder / "sparse" / "0", folder / "sparse", folder):
+    for model in (folder / "sparse" / "0", folder / "sparse", folder, folder / "0"):
         if is_colmap(model):
             return hold_out(colmap_views(model), split)
     if is_file(folder / "cameras.json"):
