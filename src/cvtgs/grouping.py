@@ -275,6 +275,11 @@ def finer_count(target: int, available: int, config: AllocationConfig) -> int:
     return available if count * MEMBERS_PER_CELL > available else count
 
 
+def most_cells(target: int, total: int, config: AllocationConfig) -> int:
+    """Return the largest possible :func:`finer_count`, whatever the filter leaves of a scene."""
+    return min(total, MEMBERS_PER_CELL * math.ceil(config.oversampling * target))
+
+
 def allocation_at(ratio: float, config: AllocationConfig) -> AllocationConfig:
     """Return the weights of the costs at a ratio of cells to Gaussians."""
     color = config.color * ratio**config.color_power

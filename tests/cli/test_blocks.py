@@ -1,22 +1,91 @@
-"""What commands that work block by block print about the folder of finished steps."""
+"""What commands that work block by block print, and which files they leave."""
 
 import argparse
 from pathlib import Path
 
 import pytest
 
+import cvtgs
 from cvtgs.cli.blocks import block_workers
+from cvtgs.cli.main import main
+from cvtgs.errors import OutputBusyError, OutputError, RunError
+from cvtgs.outofcore.memory import WORKER_BYTES
+from scenes import random_scene
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OutputError, RunError, MemoryError])
 @pytest.mark.parametrize("has_steps", [True, False])
-def test_an_interrupt_says_where_the_finished_steps_are(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], has_steps: bool
+def test_an_interrupt_or_a_failure_says_where_the_finished_steps_are(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    error: type[BaseException],
+    has_steps: bool,
 ) -> None:
     options = argparse.Namespace(output=tmp_path / "out.ply", scheduler=None, workers=1)
     folder = tmp_path / ".out.ply.blocks"
+    (folder / "key").mkdir(parents=True)
     if has_steps:
-        folder.mkdir()
-    with pytest.raises(KeyboardInterrupt), block_workers(options, 10**9):
-        raise KeyboardInterrupt
+        (folder / "key" / "sorted.json").touch()
+    with pytest.raises(error), block_workers(options, 10**9):
+        raise error
     text = f"cvtgs: {folder.resolve()} has the finished steps, with which the same command "
     assert capsys.readouterr().err.startswith(text) == has_steps
+    assert folder.exists() == has_steps
+
+
+def test_files_of_a_run_that_is_still_at_work_are_no_news(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = argparse.Namespace(output=tmp_path / "out.ply", scheduler=None, workers=1)
+    (tmp_path / ".out.ply.blocks" / "key").mkdir(parents=True)
+    (tmp_path / ".out.ply.blocks" / "key" / "sorted.json").touch()
+    with pytest.raises(OutputBusyError), block_workers(options, 10**9):
+        raise OutputBusyError
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("words", "left"),
+    [
+        (["simplify", "{}/in.ply", "{}/out.ply", "--rho", "0.1", "--preset", "draft"], "out.ply"),
+        (["levels", "{}/in.ply", "-o", "{}/out", "--rho", "0.1", "--stream", "sog"], "out"),
+    ],
+)
+def test_a_run_in_one_piece_removes_what_an_interrupted_one_left(
+    tmp_path: Path, words: list[str], left: str
+) -> None:
+    cvtgs.save(random_scene(300), tmp_path / "in.ply")
+    kept = tmp_path / f".{left}.blocks" / "key"
+    kept.mkdir(parents=True)
+    (kept / "rows_00000_00000").write_bytes(b"rows")
+    (tmp_path / f".{left}.lock").touch()
+    assert main([word.format(tmp_path) for word in (*words, "--quiet")]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.ply", left]
+
+
+def test_fewer_processes_than_wanted_are_a_warning(tmp_path: Path) -> None:
+    options = argparse.Namespace(output=tmp_path / "out.ply", scheduler=None, workers=3)
+    with (
+        pytest.warns(UserWarning, match=r"^--workers 3: the memory is enough for 1, at .* GB each"),
+        block_workers(options, 2 * WORKER_BYTES - 1) as (workers, share),
+    ):
+        assert workers is None
+        assert share == 2 * WORKER_BYTES - 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["simplify", "{}/in.ply", "{}/out.ply", "--rho", "0.1"],
+        ["levels", "{}/in.ply", "-o", "{}/out", "--rho", "0.1", "--stream", "sog"],
+    ],
+)
+def test_blocks_refuse_another_device(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, words
+) -> None:
+    cvtgs.save(random_scene(300), tmp_path / "in.ply")
+    monkeypatch.setattr("cvtgs.outofcore.memory.block_count", lambda *args, **kwargs: 4)
+    given = [word.format(tmp_path) for word in (*words, "--memory", "2GB", "--device", "cuda")]
+    assert main(given) == 1
+    error = "cvtgs: error: --device cuda cannot be used with blocks, which are computed on the CPU."
+    assert capsys.readouterr().err.strip() == error

@@ -14,12 +14,13 @@ import torch
 import cvtgs
 from cvtgs import SimplifyConfig
 from cvtgs.boxes import Box
-from cvtgs.errors import InvalidSceneError, OutputError
+from cvtgs.errors import InputError, InvalidSceneError, OutputError
 from cvtgs.io.ply import open_rows
 from cvtgs.io.tensors import save_tensors
 from cvtgs.mergenet import load_checkpoint
 from cvtgs.outofcore import simplify_file
 from cvtgs.outofcore.job import Job
+from cvtgs.outofcore.memory import LEAST_BYTES
 from cvtgs.outofcore.sort import Attempt
 from cvtgs.streams import stream_file
 from refine_cases import ring
@@ -275,3 +276,89 @@ def test_a_listener_that_raises_at_the_end_leaves_only_the_output(source, tmp_pa
         simplify_file(source, tmp_path / "out.ply", 0.05, blocks=3, listener=stop)
     assert len(cvtgs.load(tmp_path / "out.ply")) == 1000
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.ply", "out.ply"]
+
+
+def replaced(source):
+    scene = cvtgs.load(source)
+    cvtgs.save(scene.with_tensors({"means": scene.means + 100}, {}), source, overwrite=True)
+    os.utime(source, ns=(0, 0))
+
+
+def shortened(source):
+    os.truncate(source, source.stat().st_size // 2)
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [(replaced, "it changed; start again"), (shortened, "it shorter"), (Path.unlink, "no such f")],
+)
+@pytest.mark.parametrize("is_stream", [False, True])
+def test_a_source_that_changes_while_it_is_sorted_is_refused(
+    source, tmp_path, change, found, is_stream
+):
+    def spoil(event):
+        if event.stage == "sort" and event.done == 0:
+            change(source)
+
+    output = tmp_path / "out.ply"
+    with pytest.raises(InputError, match=f"in.ply: must stay as it is while .*, found {found}"):
+        if is_stream:
+            stream_file(source, output, [0.5, 0.1], kind="sog", blocks=3, listener=spoil)
+        else:
+            simplify_file(source, output, 0.05, blocks=3, listener=spoil)
+    assert {path.name for path in tmp_path.iterdir()} <= {"in.ply"}
+
+
+@pytest.mark.parametrize("stage", ["scan", "sort"])
+def test_an_interrupt_before_all_rows_are_sorted_leaves_no_folder(source, tmp_path, stage):
+    def interrupt(event):
+        if event.stage == stage and event.done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simplify_file(source, tmp_path / "out.ply", 0.05, blocks=3, listener=interrupt)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.ply"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("first", "second", "continues"),
+    [(0, 0, True), (0, 1, True), (0, 50, True), (0, 600, True), (50, 0, False), (600, 50, False)],
+)
+def test_a_run_continues_with_its_blocks_if_the_memory_is_enough(
+    source, tmp_path, monkeypatch, first, second, continues
+):
+    """The memory is in MB, above the least; with less than 600, the sample is smaller, too."""
+
+    def count(rows, memory, *, merging=0):
+        return 8 if memory < LEAST_BYTES + 20_000_000 else 4
+
+    monkeypatch.setattr("cvtgs.outofcore.memory.block_count", count)
+    first, second = (LEAST_BYTES + 1_000_000 * more for more in (first, second))
+    output, whole = tmp_path / "out.ply", tmp_path / "whole.ply"
+    simplify_file(source, whole, 0.05, memory=first)
+    with pytest.raises(StoppedError):
+        simplify_file(source, output, 0.05, memory=first, listener=stop_in_blocks)
+    report = simplify_file(source, output, 0.05, memory=second)
+    assert (report.resumed_blocks, report.blocks) == ((3, 8) if continues else (0, count(0, second)))
+    assert not continues or output.read_bytes() == whole.read_bytes()
+    assert not (tmp_path / ".out.ply.blocks").exists()
+
+
+def test_blocks_that_were_asked_for_are_used(source, tmp_path):
+    output = tmp_path / "out.ply"
+    with pytest.raises(StoppedError):
+        simplify_file(source, output, 0.05, blocks=8, listener=stop_in_blocks)
+    assert simplify_file(source, output, 0.05, blocks=4).resumed_blocks == 0
+
+
+@pytest.mark.parametrize("damage", [b"", b"{}", b'{"blocks": 8}'])
+def test_a_run_without_a_readable_layout_is_not_continued_by_another_memory(
+    source, tmp_path, monkeypatch, damage
+):
+    output = tmp_path / "out.ply"
+    with pytest.raises(StoppedError):
+        simplify_file(source, output, 0.05, blocks=8, listener=stop_in_blocks)
+    next(tmp_path.glob(".out.ply.blocks/*/layout.json")).write_bytes(damage)
+    report = simplify_file(source, output, 0.05)
+    assert (report.resumed_blocks, report.blocks) == (0, 1)

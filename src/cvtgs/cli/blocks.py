@@ -7,7 +7,8 @@ from contextlib import ExitStack, closing, contextmanager
 from typing import TYPE_CHECKING
 
 from cvtgs.cli.display import say
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import InvalidArgumentError, OutputBusyError, OutputError, RunError, warn
+from cvtgs.text import size_text
 
 if TYPE_CHECKING:
     from cvtgs.outofcore import Workers
@@ -48,33 +49,53 @@ def memory_of(options: argparse.Namespace) -> int:
     return read_bytes(options.memory)
 
 
+def check_block_device(options: argparse.Namespace) -> None:
+    """Raise if a device is wanted that blocks do not use."""
+    if options.device not in ("auto", "cpu"):
+        raise InvalidArgumentError(
+            f"--device {options.device} cannot be used with blocks, which are computed on the CPU."
+        )
+
+
 @contextmanager
 def block_workers(
     options: argparse.Namespace, memory: int
 ) -> Iterator[tuple["Workers | None", int]]:
     """Return workers, None for this process alone, and the bytes that each may use.
 
-    After an interrupt, print where the finished steps are.
+    After an interrupt or a failure, print where the finished steps are.
     """
     from cvtgs.io.locks import hidden_path
     from cvtgs.outofcore import ClusterWorkers, LocalWorkers, connect
-    from cvtgs.outofcore.memory import worker_count
+    from cvtgs.outofcore.memory import WORKER_BYTES, worker_count
+    from cvtgs.outofcore.resume import has_sorted_rows, remove_job_files
+    from cvtgs.processes import pool_size
 
-    kept = hidden_path(options.output, "blocks")
     try:
         with ExitStack() as stack:
             if options.scheduler is not None:
                 client = stack.enter_context(closing(connect(options.scheduler)))
                 yield ClusterWorkers(client), memory
-            elif (count := worker_count(memory, options.workers)) > 1:
+                return
+            count = worker_count(memory, options.workers)
+            if options.workers is not None and count < pool_size(options.workers):
+                warn(
+                    f"--workers {options.workers}: the memory is enough for {count}, at "
+                    f"{size_text(WORKER_BYTES)} each."
+                )
+            if count > 1:
                 yield stack.enter_context(LocalWorkers(count)), memory // count
             else:
                 yield None, memory
-    except KeyboardInterrupt:
-        if kept.is_dir():
-            say(
-                f"cvtgs: {kept} has the finished steps, with which the same command continues; "
-                "delete it if that is not wanted.",
-                file=sys.stderr,
-            )
+    except (KeyboardInterrupt, OutputError, RunError, MemoryError) as error:
+        if has_sorted_rows(options.output):
+            if not isinstance(error, OutputBusyError):
+                say(
+                    f"cvtgs: {hidden_path(options.output, 'blocks')} has the finished steps, with "
+                    "which the same command continues; delete it if that is not wanted.",
+                    file=sys.stderr,
+                )
+        else:
+            is_stream = getattr(options, "stream", None) is not None
+            remove_job_files(options.output, is_stream=is_stream)  # processes wrote until they end
         raise

@@ -8,7 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cvtgs
-from cvtgs.cli.blocks import add_block_options, block_workers, memory_of
+from cvtgs.cli.blocks import (
+    add_block_options,
+    block_workers,
+    check_block_device,
+    memory_of,
+)
 from cvtgs.cli.cameras import check_split, read_cameras
 from cvtgs.cli.display import TIE, progress_bars, report_notes, target_note
 from cvtgs.cli.goals import STARTED, check_goals, choose_preset, has_target, search_target
@@ -219,6 +224,8 @@ def _simplify_in_memory(
     listener: ProgressListener,
 ) -> "tuple[SimplifyReport, list[str]]":
     """Read, simplify and save a scene; return the report and notes to print with it."""
+    from cvtgs.outofcore.resume import remove_job_files
+
     notes = []
     axes = read_axes(options.axes)
     scene = read_scene(options, config, axes=axes.source)
@@ -259,6 +266,7 @@ def _simplify_in_memory(
     if chosen is not None:
         notes += chosen.late_note(report.seconds)
     cvtgs.io.save(small, options.output, overwrite=options.overwrite, axes=axes.target)
+    remove_job_files(options.output)
     return report, notes
 
 
@@ -303,6 +311,7 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
                     f"--{name.replace('_', '-')} cannot be used with blocks: the whole scene is "
                     f"needed at once."
                 )
+        check_block_device(options)
         check_config(config)
     except (ConfigError, InvalidArgumentError):
         if options.memory is not None or options.scheduler is not None:

@@ -7,7 +7,7 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 import cvtgs
-from cvtgs.cli.blocks import add_block_options, block_workers, memory_of
+from cvtgs.cli.blocks import add_block_options, block_workers, check_block_device, memory_of
 from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped
 from cvtgs.cli.options import read_axes, read_numbers
 from cvtgs.errors import ConfigError, FileFormatError, InputError, InvalidArgumentError
@@ -144,8 +144,9 @@ def stream_blocks(
             # Levels one after the other need a little more memory than the finest alone.
             if block_count(rows, memory, merging=merging + merging // 4) == 1:
                 return False
+        check_block_device(options)
         check_config(config, with_images=False)
-    except (InputError, FileFormatError, ConfigError):
+    except (InputError, FileFormatError, ConfigError, InvalidArgumentError):
         if options.scheduler is not None or (asked and options.input.suffix == ".ply"):
             raise
         return False
@@ -185,6 +186,7 @@ def stream_levels(
     listener: "ProgressListener",
 ) -> None:
     """Write levels that are in memory as a stream, and print its contents."""
+    from cvtgs.outofcore.resume import remove_job_files
     from cvtgs.streams import plan_stream, write_sog_stream, write_tiles
     from cvtgs.streams.plan import CHUNK_GAUSSIANS
 
@@ -210,6 +212,7 @@ def stream_levels(
             overwrite=options.overwrite,
             listener=listener,
         )
+    remove_job_files(options.output, is_stream=True)
     errors = [level.geometric_error for level in plan.levels]
     _print_levels(options, len(plan.chunks), written, errors=errors)
 

@@ -9,7 +9,7 @@ import cvtgs
 from cvtgs.cli.display import progress_bars, say
 from cvtgs.cli.options import AddParser, add_options
 from cvtgs.cli.paths import any_path
-from cvtgs.errors import OutputError, how_to_install
+from cvtgs.errors import OutputError, how_to_install, warn
 
 if TYPE_CHECKING:
     from cvtgs.train import History, TrainConfig
@@ -77,6 +77,8 @@ def train(options: argparse.Namespace) -> None:
         raise OutputError(f"{options.output}: the name must end in .safetensors.")
     files = cvtgs.train.TrainFiles.beside(options.output, options.cache)
     resumes = options.resume and files.state.is_file()
+    if options.resume and not resumes:
+        warn(f"{files.state}: there is no such state, so the training starts from the beginning.")
     for path in (files.checkpoint, files.state, files.curves):
         cvtgs.io.check_output(path, overwrite=options.overwrite or resumes)
     device = chosen_device(options.device)

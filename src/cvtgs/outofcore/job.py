@@ -5,8 +5,7 @@ import json
 import os
 import shutil
 import zlib
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -19,18 +18,15 @@ from torch import Tensor
 import cvtgs
 from cvtgs.boxes import Box
 from cvtgs.cameras import Cameras
-from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.errors import CvtgsError, OutputError, reason_of
 from cvtgs.io.atomic import write_atomically
 from cvtgs.io.axes import SCENE_AXES
-from cvtgs.io.locks import hidden_path
 from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.mergenet import Checkpoint, Net, load_checkpoint, save_checkpoint
 from cvtgs.outofcore.memory import CELL_ROOM
 from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, write_scan
-from cvtgs.processes import Workers
 
 SENT_BYTES = "sent_bytes"  # entry of the label file of a block: bytes of the file of its sent rows
 
@@ -321,38 +317,6 @@ class Job:
                 whole = False
             if not whole:
                 name.unlink(missing_ok=True)
-
-
-@contextmanager
-def started(
-    job: Job, workers: Workers, clock: StageClock, checkpoint: Checkpoint | None, *, resumes: bool
-) -> Iterator[None]:
-    """Make the folder of a job, unless it resumes; check the workers, and write the network.
-
-    The folder is removed if the job fails before there is anything to resume.
-    """
-    try:
-        if not resumes:
-            job.start_over()
-        check: Callable[[Job], object] | None = getattr(workers, "check", None)
-        if check is not None:  # workers on other machines
-            with clock.stage("workers"):
-                check(job)
-        if checkpoint is not None:  # a resumed job may find it damaged
-            job.write_network(checkpoint)
-        yield
-    except CvtgsError:
-        if not resumes:
-            shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
-        raise
-
-
-def job_folder(output: str | os.PathLike[str], key: str) -> str:
-    """Return the folder of a job: named by its key, in a hidden folder beside the output, or in it.
-
-    A worker that still writes for another job of this output therefore cannot write to it.
-    """
-    return str(hidden_path(output, "blocks") / key[:16])
 
 
 def _listed(cameras: Cameras) -> list[object]:

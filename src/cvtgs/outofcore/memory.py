@@ -21,6 +21,7 @@ LIBRARY_BYTES = 280_000_000 if torch.version.cuda is None else 430_000_000
 BASE_BYTES = LIBRARY_BYTES + 170_000_000  # network, sample, grid of depths, a chunk of rows
 SMALL_BASE_BYTES = LIBRARY_BYTES + 70_000_000  # the same with a quarter of the sample
 ROOMY_BYTES = LIBRARY_BYTES + 220_000_000  # with less memory than this, the sample is small
+WORKER_BYTES = 2 * ROOMY_BYTES  # of each process that works on blocks: torch, a larger block
 LEAST_BYTES = LIBRARY_BYTES + 120_000_000  # of a run in blocks: the small base, a small block
 IMAGE_BYTES = 400_000_000  # memory reserved for images of the scene and their intermediate data
 
@@ -190,4 +191,4 @@ def worker_count(memory: int, wanted: int | None) -> int:
     There is at most one per GB (1.3 GB with the CUDA build of torch), which torch and a block of
     some size need; on Windows at most 61.
     """
-    return pool_size(max(1, min(wanted or core_count(), memory // (2 * ROOMY_BYTES))))
+    return pool_size(max(1, min(wanted or core_count(), memory // WORKER_BYTES)))

@@ -20,7 +20,7 @@ from cvtgs.devices import HOST, on_host, one_thread, without_autocast
 from cvtgs.edit import concatenate
 from cvtgs.errors import ConfigError, DroppedDataWarning, check_path, warn
 from cvtgs.evaluation.scorer import check_seen
-from cvtgs.grouping import finer_count
+from cvtgs.grouping import finer_count, most_cells
 from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES, checked_axes
 from cvtgs.io.locks import output_lock
@@ -33,7 +33,7 @@ from cvtgs.outofcore.images import (
     join_refinements,
     measure,
 )
-from cvtgs.outofcore.job import Job, Manifest, job_folder, started
+from cvtgs.outofcore.job import Job, Manifest
 from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
 from cvtgs.outofcore.memory import (
     IMAGE_BYTES,
@@ -44,6 +44,7 @@ from cvtgs.outofcore.memory import (
     sample_rows,
 )
 from cvtgs.outofcore.merge import correct, inflate, merge, read_report, simplify_block
+from cvtgs.outofcore.resume import as_laid_out_before, job_folder, started
 from cvtgs.outofcore.rows import kept_rows
 from cvtgs.outofcore.scan import CHUNK, read_sample
 from cvtgs.outofcore.sort import sort_into_blocks
@@ -157,7 +158,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         elif source_axes is None:
             own = find_own_cameras(read_sample(rows, SAMPLED), source)
             cameras = None if own is None else own.cameras
-    merging = finer_count(target, rows.count, simplifier.config.allocation)
+    allocation = simplifier.config.allocation
+    merging = finer_count(target, rows.count, allocation)
     job = Job(
         folder="",
         source=rows,
@@ -168,10 +170,12 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         has_network=simplifier.checkpoint is not None,
         range_rows=whole_number(range_rows),
         sample_rows=sample_rows(room),
-        cell_room=cell_room(memory),
+        cell_room=min(cell_room(memory), most_cells(target, rows.count, allocation)),
         axes=checked_axes(output_axes or SCENE_AXES) if is_plain_ply(output) else SCENE_AXES,
         cameras=cameras if simplifier.config.uses_images else None,
     )
+    if blocks is None:
+        job = as_laid_out_before(job, output, key_of=lambda job: job.key(simplifier.checkpoint))
     key = job.key(simplifier.checkpoint)
     job = replace(job, folder=job_folder(output, key))
     clock = StageClock(listener, HOST)

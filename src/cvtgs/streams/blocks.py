@@ -27,13 +27,14 @@ from cvtgs.io.files import check_degree
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
 from cvtgs.outofcore import Workers
-from cvtgs.outofcore.job import Job, job_folder, started
+from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.memory import (
     check_memory,
     chosen_blocks,
     memory_to_plan,
     sample_rows,
 )
+from cvtgs.outofcore.resume import as_laid_out_before, job_folder, started
 from cvtgs.outofcore.rows import analysis_of, read_rows
 from cvtgs.outofcore.run import check_config, rows_per_range
 from cvtgs.outofcore.sort import sort_into_blocks
@@ -251,10 +252,15 @@ def stream_file(  # noqa: PLR0913 (options by name)
         sample_rows=sample_rows(room),
     )
     choices = repr((form, chunk_gaussians, axes, sh_degree, environment_radii))
-    facts = [job.key(simplifier.checkpoint), targets, choices]
-    key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+
+    def key_of(job: Job) -> str:
+        facts = [job.key(simplifier.checkpoint), targets, choices]
+        return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+
+    if blocks is None:
+        job = as_laid_out_before(job, folder, key_of=key_of)
     spec = StreamJob(
-        job=replace(job, folder=job_folder(folder, key)),
+        job=replace(job, folder=job_folder(folder, key_of(job))),
         form=form,
         chunk_gaussians=chunk_gaussians,
         axes=axes,

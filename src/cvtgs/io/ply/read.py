@@ -18,8 +18,10 @@ from cvtgs.counts import whole_number
 from cvtgs.errors import (
     DroppedDataWarning,
     FileFormatError,
+    InputError,
     MissingDependencyError,
     how_to_install,
+    reason_of,
     warn,
 )
 from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
@@ -320,7 +322,14 @@ class PlyRows:
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Map a range of rows into memory; pages are read on use."""
         place = self.offset + start * self.dtype.itemsize
-        return np.memmap(self.path, self.dtype, "r", place, (stop - start,)).view(np.ndarray)
+        try:
+            mapped = np.memmap(self.path, self.dtype, "r", place, (stop - start,))
+        except (OSError, ValueError) as error:
+            found = "it shorter" if isinstance(error, ValueError) else reason_of(error)
+            raise InputError(
+                f"{self.path}: must stay as it is while it is read, found {found}."
+            ) from error
+        return mapped.view(np.ndarray)
 
     def scene(self, rows: NDArray[Any]) -> GaussianScene:
         """Build a scene from rows with at least the columns of the file, as a load returns it."""

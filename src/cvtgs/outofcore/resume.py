@@ -1,0 +1,112 @@
+"""The folder of a job: started, continued after an interruption, and removed."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pydantic
+
+from cvtgs.clock import StageClock
+from cvtgs.errors import InputError, OutputError
+from cvtgs.io.locks import hidden_path, lock_path, output_lock
+from cvtgs.mergenet import Checkpoint
+from cvtgs.outofcore.job import Job
+from cvtgs.processes import Workers
+
+
+class Layout(pydantic.BaseModel):
+    """The sizes of a job that its memory decides."""
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
+
+    blocks: int
+    sample_rows: int
+    cell_room: int
+
+
+@contextmanager
+def started(
+    job: Job, workers: Workers, clock: StageClock, checkpoint: Checkpoint | None, *, resumes: bool
+) -> Iterator[None]:
+    """Make the folder of a job, unless it resumes; check the workers, and write the network.
+
+    The body sorts the rows. If it fails or the source changes meanwhile, there is nothing to
+    resume, and the folder is removed.
+    """
+    before = _stamp(job.source.path)
+    try:
+        if not resumes:
+            job.start_over()
+            layout = {name: getattr(job, name) for name in Layout.model_fields}
+            job.write_file("layout.json", json.dumps(layout).encode())
+        check: Callable[[Job], object] | None = getattr(workers, "check", None)
+        if check is not None:  # workers on other machines
+            with clock.stage("workers"):
+                check(job)
+        if checkpoint is not None:  # a resumed job may find it damaged
+            job.write_network(checkpoint)
+        yield
+        if not resumes and _stamp(job.source.path) != before:
+            raise InputError(
+                f"{job.source.path}: must stay as it is while it is read, found it changed; start "
+                "again."
+            )
+    except BaseException:
+        if not resumes:
+            shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
+        raise
+
+
+def _stamp(path: str) -> tuple[int, int] | None:
+    """Return size and time of a file; None if it does not exist any more."""
+    try:
+        stat = Path(path).stat()
+    except OSError:
+        return None
+    return stat.st_size, stat.st_mtime_ns
+
+
+def as_laid_out_before(
+    job: Job, output: str | os.PathLike[str], *, key_of: Callable[[Job], str]
+) -> Job:
+    """Return a job with the layout of an interrupted run of it, unless that needs more memory.
+
+    Otherwise a run with a little more or less free memory could not continue that one.
+    """
+    for path in hidden_path(output, "blocks").glob("*/layout.json"):
+        try:
+            layout = Layout.model_validate_json(path.read_bytes())
+        except (OSError, ValueError):
+            continue
+        earlier = replace(job, **layout.model_dump())
+        fits = earlier.blocks >= job.blocks and earlier.sample_rows <= job.sample_rows
+        fits = fits and earlier.cell_room <= job.cell_room
+        if fits and Path(job_folder(output, key_of(earlier))) == path.parent:
+            return earlier
+    return job
+
+
+def has_sorted_rows(output: str | os.PathLike[str]) -> bool:
+    """Return whether an interrupted run of an output has rows to continue with."""
+    return any(hidden_path(output, "blocks").glob("*/sorted.json"))
+
+
+def remove_job_files(output: str | os.PathLike[str], *, is_stream: bool = False) -> None:
+    """Remove the files that interrupted runs of an output left, unless another run uses them."""
+    folder = hidden_path(output, "blocks")
+    locked = folder if is_stream else output  # commands lock the output of a stream
+    if folder.is_dir() or lock_path(locked).exists():
+        with suppress(OutputError), output_lock(locked):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def job_folder(output: str | os.PathLike[str], key: str) -> str:
+    """Return the folder of a job: named by its key, in a hidden folder beside the output, or in it.
+
+    A worker that still writes for another job of this output therefore cannot write to it.
+    """
+    return str(hidden_path(output, "blocks") / key[:16])
