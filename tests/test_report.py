@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Hashable
+from types import SimpleNamespace
 
 import pydantic
 import pytest
@@ -84,6 +85,17 @@ def test_a_stage_that_fails_has_no_cost_and_no_end():
         1 / 0  # noqa: B018
     assert clock.costs == []
     assert [event.done for event in events] == [0]
+
+
+def test_a_stage_that_runs_again_adds_its_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    walls, cpus = iter([10.0, 12.0, 20.0, 20.5]), iter([1.0, 1.25, 2.0, 3.0])
+    times = SimpleNamespace(perf_counter=lambda: next(walls), process_time=lambda: next(cpus))
+    monkeypatch.setattr("cvtgs.clock.time", times)
+    clock = StageClock(silent, CPU)
+    for _ in range(2):
+        with clock.stage("sort"):
+            pass
+    assert [(cost.seconds, cost.cpu_seconds) for cost in clock.costs] == [(2.5, 1.25)]
 
 
 def test_peak_memory_never_falls():

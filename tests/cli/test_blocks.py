@@ -65,12 +65,12 @@ def test_a_run_in_one_piece_removes_what_an_interrupted_one_left(
 
 def test_fewer_processes_than_wanted_are_a_warning(tmp_path: Path) -> None:
     options = argparse.Namespace(output=tmp_path / "out.ply", scheduler=None, workers=3)
-    with (
-        pytest.warns(UserWarning, match=r"^--workers 3: the memory is enough for 1, at .* GB each"),
-        block_workers(options, 2 * WORKER_BYTES - 1) as (workers, share),
+    start = block_workers(options, 2 * WORKER_BYTES - 1)
+    with pytest.warns(
+        UserWarning, match=r"^--workers 3: the memory is enough for 1, at .* GB each"
     ):
-        assert workers is None
-        assert share == 2 * WORKER_BYTES - 1
+        assert start.__enter__() == (None, 2 * WORKER_BYTES - 1)
+    start.__exit__(None, None, None)
 
 
 @pytest.mark.parametrize(

@@ -171,8 +171,8 @@ def test_resume_continues_an_interrupted_training(again, made, tmp_path, capsys,
 @pytest.mark.slow
 def test_resume_without_a_state_says_so_and_starts_a_training(again, made, tmp_path, capsys):
     assert main([*again, "--resume", "--quiet"]) == 0
-    warning = f"cvtgs: warning: {tmp_path}/net.state: there is no such state, so the training starts"
-    assert capsys.readouterr().err.startswith(warning)
+    found = "there is no such state, so the training starts from the beginning."
+    assert capsys.readouterr().err == f"cvtgs: warning: {tmp_path}/net.state: {found}\n"
     assert (tmp_path / "net.state").read_bytes() == (made / "net.state").read_bytes()
 
 

@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -16,8 +17,9 @@ from cvtgs.errors import (
     InvalidArgumentError,
     MissingDependencyError,
 )
-from cvtgs.evaluation import LpipsWeights, load_lpips, lpips
+from cvtgs.evaluation import Evaluation, LpipsWeights, load_lpips, lpips
 from cvtgs.evaluation.lpips import LPIPS_VARIABLE
+from cvtgs.evaluation.scorer import NOT_ASKED_FOR, chosen_metrics
 from lpips_cases import random_images, random_state, random_weights
 
 
@@ -194,3 +196,31 @@ def test_distances_with_published_weights_grow_with_distortion() -> None:
     by_blur = [distance(blurred(side)) for side in (3, 5, 9)]
     for values in (by_noise, by_blur):
         assert 0 < values[0] < values[1] < values[2] < 2
+
+
+def test_without_weights_the_note_is_the_error_without_its_full_stop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def none(network: str) -> None:
+        raise InputError(f"there are no weights of {network}.")
+
+    monkeypatch.setattr("cvtgs.evaluation.scorer.load_lpips", none)
+    found = chosen_metrics("auto", (64, 64))
+    assert (found.lpips, found.note) == (None, "there are no weights of alex")
+
+
+def test_lpips_that_nobody_asked_for_needs_no_sentence() -> None:
+    settings: dict[str, Any] = {
+        "reference": "a",
+        "reference_count": 5,
+        "views": (),
+        "width": 8,
+        "height": 8,
+    }
+    for note, sentence in {
+        NOT_ASKED_FOR: "",
+        "": "",
+        "there is no weight": "LPIPS was not measured: there is no weight.",
+    }.items():
+        found = Evaluation(backend="torch", scenes=(), lpips_note=note, **settings)
+        assert found.lpips_sentence == sentence

@@ -214,3 +214,10 @@ def test_gaussians_that_no_renderer_draws_are_not_seen() -> None:
     with pytest.raises(InvalidArgumentError, match="the cameras must see it, found nothing"):
         check_seen(scene, camera, name="it")
     check_seen(scene.select([0]), camera, name="it")  # if nothing is drawn, all centres count
+
+
+def test_alpha_is_clipped_before_it_is_compared() -> None:
+    one, other = torch.tensor([[[1.5, -0.5, 0.25]]]), torch.tensor([[[1.0, 0.0, 0.5]]])
+    assert alpha_error(one, other).item() == alpha_error(other, one).item() == pytest.approx(1 / 12)
+    assert alpha_bias(one, other).item() == pytest.approx(-1 / 12)
+    assert alpha_bias(other, one).item() == pytest.approx(1 / 12)

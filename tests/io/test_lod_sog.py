@@ -12,10 +12,11 @@ import torch
 
 from cvtgs import GaussianScene, load, save
 from cvtgs.cli.main import main
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import FileFormatError, InvalidArgumentError
 from cvtgs.io import atomic_output, scene_size
 from cvtgs.io.sog import encode_sog
 from cvtgs.io.sog.write import palette
+from cvtgs.text import shown
 from format_cases import refusal, storable_scene
 from scenes import same_bits
 
@@ -110,6 +111,17 @@ def test_a_chunk_without_the_level_gives_nothing_if_others_have_all_of_it(stream
     assert load(path, lod=1).means.tolist() == means(coarse, far)
 
 
+def test_an_empty_level_gives_the_next_one(stream: Path) -> None:
+    def drop(document: dict[str, Any]) -> None:
+        for child in document["tree"]["children"]:
+            del child["lods"]["0"]
+        document.update(counts=[0, 5])
+
+    path = changed(stream, drop)
+    coarse, far = (load(stream / name / "meta.json").means for name in ("1_0", "env"))
+    assert load(path).means.tolist() == means(coarse, far)
+
+
 def test_commands_accept_lod(stream: Path, tmp_path: Path) -> None:
     words = ["convert", str(stream), str(tmp_path / "a.ply"), "--quiet", "--lod", "1"]
     assert main(words) == 0
@@ -153,6 +165,10 @@ DAMAGE: dict[str, tuple[Change, str]] = {
     "level": (
         lambda d: d.update(tree={"lods": {"fine": {}}}),
         "chunk 0: levels must be whole numbers, found 'fine'.",
+    ),
+    "level of many digits": (  # more than Python converts to a number
+        lambda d: d.update(tree={"lods": {"9" * 5000: {}}}),
+        f"chunk 0: levels must be whole numbers, found {shown('9' * 5000)}.",
     ),
     "count": (
         lambda d: rows(d).update(count=-1),
@@ -213,6 +229,29 @@ def test_missing_and_short_files_are_refused(stream: Path) -> None:
     assert refusal(stream) == (
         f"{path}: must have the 4 Gaussians that the stream reads from it, found 2."
     )
+
+
+def test_a_file_too_short_for_its_last_chunk_is_refused(stream: Path) -> None:
+    shutil.rmtree(stream / "1_0")
+    write_folder(storable_scene(4, degree=1), stream / "1_0")
+    with pytest.raises(FileFormatError, match=r"must have the 5 Gaussians that the .*, found 4"):
+        load(stream, lod=1)
+
+
+def test_the_highest_degree_of_the_files_limits_their_expansion(
+    stream: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checked: list[tuple[int, int]] = []
+
+    def check(_path: Path, *, count: int, sh_degree: int, stored: int) -> None:
+        assert stored == sum(scene_size(stream / name / "meta.json") for name in ("1_0", "env"))
+        checked.append((count, sh_degree))
+
+    shutil.rmtree(stream / "env")
+    write_folder(storable_scene(2, degree=0), stream / "env")
+    monkeypatch.setattr("cvtgs.io.sog.stream.check_expansion", check)
+    load(stream, lod=1)
+    assert checked == [(5, 1), (7, 1)]
 
 
 def test_the_palette_splits_no_column_that_varies_by_rounding_only() -> None:

@@ -207,6 +207,10 @@ DATA_CASES: Mapping[str, tuple[bytes, str]] = {
         WITH_FACES[:-1],
         f"{SHORT} 3 rows of 'vertex', found 2.",
     ),
+    "lying behind faces": (
+        WITH_FACES.replace(b"vertex 3", b"vertex 99999999999999"),
+        f"{SHORT} 99,999,999,999,999 rows of 'vertex', found room for at most 3.",
+    ),
     "list longer than the file": (
         WITH_FACES[:FACE_START] + b"\x7f" + WITH_FACES[FACE_START + 1 :],
         f"{SHORT} 2 rows of 'face', found 0.",

@@ -129,9 +129,10 @@ def test_extra_columns_keep_every_value(
     assert scene.layout[0] == ("label", kind)
 
 
-def test_double_coordinates_make_a_float64_scene(tmp_path: Path) -> None:
+@pytest.mark.parametrize("axes", ["xyz", "x"])
+def test_double_coordinates_make_a_float64_scene(tmp_path: Path, axes: str) -> None:
     properties = [
-        (name, "double" if name in "xyz" else kind) for name, kind in gaussian_properties()
+        (name, "double" if name in axes else kind) for name, kind in gaussian_properties()
     ]
     rows = gaussian_rows(properties, 1)
     rows[0][0] = 0.1
@@ -169,6 +170,21 @@ def test_comments_are_kept_wherever_they_are_in_the_header(tmp_path: Path) -> No
     assert scene.comments == ("SplatRenderMode: mip", "", " two  blanks", "K\u00e4se")
     assert scene.antialiased
     assert same(scene, load_with_plyfile(path))
+
+
+def test_a_comment_between_carriage_returns_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "s.ply"
+    write_ply_file(path, PROPERTIES, ROWS, comments=["first\nsecond"], newline="\r")
+    assert load(path).comments == ("first second",)  # else no PLY could hold it
+
+
+def test_empty_lists_need_no_room_for_items(tmp_path: Path) -> None:
+    faces = {"face": ([("corners", "list uchar double")], [[[]], [[]]])}
+    path = write_ply_file(tmp_path / "s.ply", PROPERTIES, ROWS, before=faces)
+    plain = write_ply_file(tmp_path / "plain.ply", PROPERTIES, ROWS)
+    with pytest.warns(DroppedDataWarning, match=r"element 'face' \(2 rows\)"):
+        found = load(path)
+    assert same(found, load(plain))
 
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n", "\r", "  \n", " \t\r\n"])

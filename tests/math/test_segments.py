@@ -25,11 +25,18 @@ def test_argmin_of_labels_names_the_first_of_equals():
     assert segments.label_argmin(values, labels, 4).tolist() == [0, 4, 1, 4]
 
 
+def test_smallest_rows_end_with_nan_if_there_are_too_few_numbers() -> None:
+    values = torch.tensor([float("nan")] * 4 + [2.0, 1.0] + [float("nan")] * 4)
+    assert segments.smallest_rows(values, 4).tolist() == [5, 4, 0, 1]
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_ascending_rows_equal_a_stable_sort(dtype):
     inf, nan = float("inf"), float("nan")
     values = torch.tensor([0.5, -0.0, inf, 0.0, -2.0, nan, -inf, 0.5, -1.0, -nan], dtype=dtype)
     assert segments.ascending_rows(values).tolist() == [6, 4, 8, 1, 3, 0, 7, 2, 5, 9]
+    zeros = torch.tensor([0.0, -0.0, 0.0], dtype=dtype)
+    assert segments.ascending_rows(zeros).tolist() == [0, 1, 2]
     many = torch.randint(-50, 50, (5000,), generator=torch.Generator().manual_seed(0)).to(dtype)
     wanted = sorted(range(5000), key=lambda row: float(many[row]))
     assert segments.ascending_rows(many / 7).tolist() == wanted

@@ -1,17 +1,20 @@
 """Blocks are matched and refined while the others are rendered but fixed: no seams, same bits."""
 
+from typing import Any
+
 import pytest
 import torch
 
 import cvtgs
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.boxes import Box
+from cvtgs.clock import StageCost
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.outofcore import LocalWorkers, simplify_file
 from cvtgs.outofcore import images as module
 from cvtgs.outofcore.memory import IMAGE_BYTES, LEAST_BYTES
-from cvtgs.report import MatchReport
+from cvtgs.report import MatchReport, RefineReport
 from cvtgs.views import automatic_views
 
 COUNT, LARGER_COUNT = 200, 800
@@ -90,12 +93,12 @@ def scores(tmp_path_factory):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_matching_in_blocks_improves_psnr(scores):
     assert scores["matched"]["blocks"] > scores["standard"]["blocks"] + 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_matching_adds_little_to_the_loss_from_blocks(scores):
     losses = {name: found["one"] - found["blocks"] for name, found in scores.items()}
     assert losses["matched"] < losses["standard"] + 0.3
@@ -141,6 +144,29 @@ def test_reports_of_matched_blocks_are_joined():
     two = MatchReport(views=5, opacities_kept=False, psnr_before=24.0, psnr_after=30.0, **shared)
     wanted = MatchReport(views=8, opacities_kept=False, psnr_before=22.0, psnr_after=26.5, **shared)
     assert module.join_matchings([one, two]) == wanted
+
+
+def refine_report(stopped: str, **changes: Any) -> RefineReport:
+    cost = StageCost(stage="refine", seconds=2.0, cpu_seconds=5.0, peak_memory_bytes=7)
+    values: dict[str, Any] = {
+        "steps": 3,
+        "images": 4,
+        "heldout": 2,
+        "psnr_before": 20.0,
+        "psnr_after": 21.0,
+    }
+    values |= {"gain": 1.0, "changed_count": 9, "backend": "numba", "device": "cpu", "cost": cost}
+    return RefineReport(stopped=stopped, **(values | changes))
+
+
+@pytest.mark.parametrize(("other", "stopped"), [("patience", "patience"), ("time", "steps")])
+def test_reports_of_refined_blocks_are_joined(other: str, stopped: str) -> None:
+    more = {"psnr_after": 23.0, "gain": 3.0, "changed_count": 0, "heldout": 1}
+    joined = module.join_refinements([refine_report("patience"), refine_report(other, **more)])
+    sums = {"steps": 6, "images": 8, "heldout": 3, "changed_count": 9}
+    wanted = refine_report(stopped, psnr_after=22.0, gain=2.0, **sums)
+    cost = wanted.cost.model_copy(update={"seconds": 4.0, "cpu_seconds": 10.0})
+    assert joined == wanted.model_copy(update={"cost": cost})
 
 
 def test_images_raise_the_least_memory(source, tmp_path):

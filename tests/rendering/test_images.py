@@ -253,6 +253,22 @@ def test_wrong_arguments_are_refused(options, text):
             {"Ks": torch.tensor([[[9.0, 1, 4], [0, 9, 4], [0, 0, 1]]])},
             "Ks of pinhole cameras, focal lengths above 0 and no skew",
         ),
+        (
+            {"Ks": torch.tensor([[[9.0, 0, 4], [1, 9, 4], [0, 0, 1]]])},
+            "Ks of pinhole cameras, focal lengths above 0 and no skew",
+        ),
+        (
+            {"Ks": torch.tensor([[[-9.0, 0, 4], [0, 9, 4], [0, 0, 1]]])},
+            "Ks of pinhole cameras, focal lengths above 0 and no skew",
+        ),
+        (
+            {"Ks": torch.tensor([[[9.0, 0, 4], [0, 0, 4], [0, 0, 1]]])},
+            "Ks of pinhole cameras, focal lengths above 0 and no skew",
+        ),
+        (
+            {"Ks": torch.tensor([[[9.0, 0, math.inf], [0, 9, 4], [0, 0, 1]]])},
+            "finite viewmats and Ks",
+        ),
         ({"Ks": 2 * straight(dtype=torch.float32).Ks}, "Ks with the last row 0, 0, 1"),
     ],
 )

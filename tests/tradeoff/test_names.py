@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 import cvtgs
+from cvtgs import GaussianScene
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.tradeoff import measure_tradeoff
-from cvtgs.tradeoff.measure import Task, run_task
+from cvtgs.tradeoff.measure import Task, check_results, run_task
 from cvtgs.views import automatic_views
 
 TASK = Task(preset="draft", rho=0.1)
@@ -34,6 +35,18 @@ def test_a_result_does_not_replace_the_scene_that_later_presets_read(tmp_path, s
         )
     assert file.read_bytes() == before
     assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_scene_is_not_replaced_through_a_link_to_its_folder(
+    tmp_path: Path, scene: GaussianScene
+) -> None:
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "scenes")
+    file = tmp_path / "scenes" / TASK.file_name
+    cvtgs.save(scene, file)
+    with pytest.raises(InvalidArgumentError, match=r"draft_0\.1\.ply: a result must not replace"):
+        check_results(file, tmp_path / "link", [TASK])
+    check_results(file, tmp_path, [TASK])
 
 
 @pytest.mark.slow

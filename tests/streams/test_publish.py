@@ -1,0 +1,54 @@
+"""How the files of a finished stream get to the output folder."""
+
+from pathlib import Path
+
+import pytest
+
+from cvtgs import Simplifier, load
+from cvtgs.io.atomic import replace_file
+from cvtgs.streams import StreamPlan, plan_stream, write_sog_stream
+from cvtgs.synthetic import scene as make
+
+
+@pytest.fixture(scope="module")
+def plan() -> StreamPlan:
+    scene = make("object", 300, sh_degree=0, seed=3)
+    return plan_stream(Simplifier(preset="draft", device="cpu").levels(scene, [1.0, 0.1]))
+
+
+def test_an_interrupted_replacement_keeps_the_old_stream(
+    plan: StreamPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupts = [KeyboardInterrupt]
+
+    def move(source: Path, target: Path) -> None:
+        if source.suffix == ".json" and interrupts:  # the index, the last one
+            raise interrupts.pop()
+        replace_file(source, target)
+
+    write_sog_stream(plan, tmp_path / "out")
+    monkeypatch.setattr("cvtgs.streams.files.replace_file", move)
+    with pytest.raises(KeyboardInterrupt):
+        write_sog_stream(plan, tmp_path / "out", overwrite=True)
+    assert [len(load(tmp_path / "out", lod=lod)) for lod in (0, 1)] == [300, 30]
+
+
+def test_a_link_to_a_missing_folder_stays_a_link(plan: StreamPlan, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    write_sog_stream(plan, tmp_path / "link")
+    assert (tmp_path / "link").is_symlink()
+    assert len(load(tmp_path / "real")) == 300
+
+
+def test_a_folder_behind_a_link_in_a_replaced_stream_is_kept(
+    plan: StreamPlan, tmp_path: Path
+) -> None:
+    write_sog_stream(plan, tmp_path / "out")
+    (folder, *_) = (path for path in (tmp_path / "out").iterdir() if path.is_dir())
+    folder.rename(tmp_path / "elsewhere")
+    folder.symlink_to(tmp_path / "elsewhere")
+    before = sorted((tmp_path / "elsewhere").iterdir())
+    write_sog_stream(plan, tmp_path / "out", overwrite=True)
+    assert sorted((tmp_path / "elsewhere").iterdir()) == before
+    assert not folder.is_symlink()
+    assert len(load(tmp_path / "out")) == 300
