@@ -16,21 +16,35 @@ def plan() -> StreamPlan:
     return plan_stream(Simplifier(preset="draft", device="cpu").levels(scene, [1.0, 0.1]))
 
 
+def files_of(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("number", range(6))
 def test_an_interrupted_replacement_keeps_the_old_stream(
-    plan: StreamPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    plan: StreamPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    interrupts = [KeyboardInterrupt]
+    """Two chunks are set aside, two and an index take their place."""
+    numbers = iter(range(100))
 
     def move(source: Path, target: Path) -> None:
-        if source.suffix == ".json" and interrupts:  # the index, the last one
-            raise interrupts.pop()
+        if next(numbers) == number:
+            raise KeyboardInterrupt
         replace_file(source, target)
 
-    write_sog_stream(plan, tmp_path / "out")
+    other = make("object", 200, sh_degree=0, seed=4)
+    levels = Simplifier(preset="draft", device="cpu").levels(other, [1.0, 0.1])
+    write_sog_stream(plan_stream(levels), tmp_path / "out")
+    before = files_of(tmp_path)
     monkeypatch.setattr("cvtgs.streams.files.replace_file", move)
-    with pytest.raises(KeyboardInterrupt):
+    if number < 5:
+        with pytest.raises(KeyboardInterrupt):
+            write_sog_stream(plan, tmp_path / "out", overwrite=True)
+        assert files_of(tmp_path) == before
+    else:
         write_sog_stream(plan, tmp_path / "out", overwrite=True)
-    assert [len(load(tmp_path / "out", lod=lod)) for lod in (0, 1)] == [300, 30]
+        assert [len(load(tmp_path / "out", lod=lod)) for lod in (0, 1)] == [300, 30]
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 def test_a_link_to_a_missing_folder_stays_a_link(plan: StreamPlan, tmp_path: Path) -> None:

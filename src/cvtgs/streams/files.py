@@ -200,8 +200,9 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
 def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
     """Move the files of a finished stream to the output folder, the index last.
 
-    A folder that exists is kept, since it has permissions and may be the current one of a shell.
-    Hidden files are not published: only resumed runs need them.
+    Files of the stream that it replaces are set aside, and moved back if this fails. A folder that
+    exists is kept, since it has permissions and may be the current one of a shell. Hidden files are
+    not published: only resumed runs need them.
     """
     check_stream(place, kind, overwrite=overwrite)
     index, target = INDEX_NAMES[kind], Path(os.path.realpath(place))
@@ -209,29 +210,31 @@ def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
         if not target.exists():  # then one rename publishes all files
             hidden.rename(target)
             for path in target.glob(".*"):
-                path.unlink()
+                _remove(path)
             return
     except OSError as error:
         raise _refused(place, error) from error
-    found = [path.name for path in hidden.iterdir()]
-    names = [name for name in found if name != index and not name.startswith(".")]
-    old = _names_of(place / index) - {*names}
-    is_new = not (place / index).exists()
+    found = {path.name for path in hidden.iterdir()}
+    names = sorted(name for name in found if name != index and not name.startswith("."))
+    old = sorted({*names, *_names_of(place / index)})
+    aside, moved = hidden / ".replaced", list[tuple[Path, Path]]()
+    moves = [(place / name, aside / name) for name in old if os.path.lexists(place / name)]
+    moves += [(hidden / name, place / name) for name in (*names, index)]
     try:
-        for name in [*names, index]:
-            if (place / name).is_dir():
-                _remove(place / name)
-            replace_file(hidden / name, place / name)
-        for name in old:  # left over from the replaced stream
-            _remove(place / name)
+        _remove(aside)  # of an earlier run
+        aside.mkdir()
+        for source, goal in moves:
+            replace_file(source, goal)
+            moved.append((source, goal))
     except BaseException as error:
-        written = [name for name in [index, *names] if (place / name).exists()]
-        for name in written if is_new else ():
+        for source, goal in reversed(moved) if (hidden / index).exists() else ():
             with suppress(OSError):
-                replace_file(place / name, hidden / name)  # a resumed run needs it there
+                replace_file(goal, source)  # a resumed run needs it there
         if isinstance(error, OSError):
             raise _refused(place, error) from error
         raise
+    with suppress(OSError):
+        _remove(aside)
 
 
 def _names_of(index: Path) -> set[str]:
