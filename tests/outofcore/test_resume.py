@@ -355,12 +355,12 @@ def test_blocks_that_were_asked_for_are_used(source, tmp_path):
 
 
 @pytest.mark.parametrize("damage", [b"", b"{}", b'{"blocks": 8}'])
-def test_a_run_without_a_readable_layout_is_not_continued_by_another_memory(
+def test_a_run_without_readable_sizes_is_not_continued_by_another_memory(
     source, tmp_path, monkeypatch, damage
 ):
     output = tmp_path / "out.ply"
     with pytest.raises(StoppedError):
         simplify_file(source, output, 0.05, blocks=8, listener=stop_in_blocks)
-    next(tmp_path.glob(".out.ply.blocks/*/layout.json")).write_bytes(damage)
+    next(tmp_path.glob(".out.ply.blocks/*/sizes.json")).write_bytes(damage)
     report = simplify_file(source, output, 0.05)
     assert (report.resumed_blocks, report.blocks) == (0, 1)

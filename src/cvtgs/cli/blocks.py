@@ -68,7 +68,7 @@ def block_workers(
     from cvtgs.io.locks import hidden_path
     from cvtgs.outofcore import ClusterWorkers, LocalWorkers, connect
     from cvtgs.outofcore.memory import WORKER_BYTES, worker_count
-    from cvtgs.outofcore.resume import has_sorted_rows, remove_job_files
+    from cvtgs.outofcore.resume import can_continue, remove_job_files
     from cvtgs.processes import pool_size
 
     try:
@@ -88,7 +88,7 @@ def block_workers(
             else:
                 yield None, memory
     except (KeyboardInterrupt, OutputError, RunError, MemoryError) as error:
-        if has_sorted_rows(options.output):
+        if can_continue(options.output):
             if not isinstance(error, OutputBusyError):
                 say(
                     f"cvtgs: {hidden_path(options.output, 'blocks')} has the finished steps, with "

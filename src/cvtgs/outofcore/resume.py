@@ -18,7 +18,7 @@ from cvtgs.outofcore.job import Job
 from cvtgs.processes import Workers
 
 
-class Layout(pydantic.BaseModel):
+class JobSizes(pydantic.BaseModel):
     """The sizes of a job that its memory decides."""
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -41,8 +41,8 @@ def started(
     try:
         if not resumes:
             job.start_over()
-            layout = {name: getattr(job, name) for name in Layout.model_fields}
-            job.write_file("layout.json", json.dumps(layout).encode())
+            sizes = {name: getattr(job, name) for name in JobSizes.model_fields}
+            job.write_file("sizes.json", json.dumps(sizes).encode())
         check: Callable[[Job], object] | None = getattr(workers, "check", None)
         if check is not None:  # workers on other machines
             with clock.stage("workers"):
@@ -70,19 +70,19 @@ def _stamp(path: str) -> tuple[int, int] | None:
     return stat.st_size, stat.st_mtime_ns
 
 
-def as_laid_out_before(
+def with_earlier_sizes(
     job: Job, output: str | os.PathLike[str], *, key_of: Callable[[Job], str]
 ) -> Job:
-    """Return a job with the layout of an interrupted run of it, unless that needs more memory.
+    """Return a job with the sizes of an interrupted run of it, unless that needs more memory.
 
     Otherwise a run with a little more or less free memory could not continue that one.
     """
-    for path in hidden_path(output, "blocks").glob("*/layout.json"):
+    for path in hidden_path(output, "blocks").glob("*/sizes.json"):
         try:
-            layout = Layout.model_validate_json(path.read_bytes())
+            sizes = JobSizes.model_validate_json(path.read_bytes())
         except (OSError, ValueError):
             continue
-        earlier = replace(job, **layout.model_dump())
+        earlier = replace(job, **sizes.model_dump())
         fits = earlier.blocks >= job.blocks and earlier.sample_rows <= job.sample_rows
         fits = fits and earlier.cell_room <= job.cell_room
         if fits and Path(job_folder(output, key_of(earlier))) == path.parent:
@@ -90,7 +90,7 @@ def as_laid_out_before(
     return job
 
 
-def has_sorted_rows(output: str | os.PathLike[str]) -> bool:
+def can_continue(output: str | os.PathLike[str]) -> bool:
     """Return whether an interrupted run of an output has rows to continue with."""
     return any(hidden_path(output, "blocks").glob("*/sorted.json"))
 

@@ -44,7 +44,7 @@ from cvtgs.outofcore.memory import (
     sample_rows,
 )
 from cvtgs.outofcore.merge import correct, inflate, merge, read_report, simplify_block
-from cvtgs.outofcore.resume import as_laid_out_before, job_folder, started
+from cvtgs.outofcore.resume import job_folder, started, with_earlier_sizes
 from cvtgs.outofcore.rows import kept_rows
 from cvtgs.outofcore.scan import CHUNK, read_sample
 from cvtgs.outofcore.sort import sort_into_blocks
@@ -175,7 +175,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         cameras=cameras if simplifier.config.uses_images else None,
     )
     if blocks is None:
-        job = as_laid_out_before(job, output, key_of=lambda job: job.key(simplifier.checkpoint))
+        job = with_earlier_sizes(job, output, key_of=lambda job: job.key(simplifier.checkpoint))
     key = job.key(simplifier.checkpoint)
     job = replace(job, folder=job_folder(output, key))
     clock = StageClock(listener, HOST)

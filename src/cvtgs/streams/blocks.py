@@ -34,7 +34,7 @@ from cvtgs.outofcore.memory import (
     memory_to_plan,
     sample_rows,
 )
-from cvtgs.outofcore.resume import as_laid_out_before, job_folder, started
+from cvtgs.outofcore.resume import job_folder, started, with_earlier_sizes
 from cvtgs.outofcore.rows import analysis_of, read_rows
 from cvtgs.outofcore.run import check_config, rows_per_range
 from cvtgs.outofcore.sort import sort_into_blocks
@@ -258,7 +258,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     if blocks is None:
-        job = as_laid_out_before(job, folder, key_of=key_of)
+        job = with_earlier_sizes(job, folder, key_of=key_of)
     spec = StreamJob(
         job=replace(job, folder=job_folder(folder, key_of(job))),
         form=form,
