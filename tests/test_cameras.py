@@ -93,8 +93,18 @@ def test_sizes_that_are_no_whole_numbers_are_refused(work, text):
 def test_first_pixels_beyond_the_stride_are_refused(first):
     with pytest.raises(InvalidArgumentError) as caught:
         Cameras(**GOOD).every(2, first=first)
-    text = f"first must be a column and a row from 0 to 1, found {first!r}."
+    text = f"first must be a column from 0 to 1 and a row from 0 to 1, found {first!r}."
     assert str(caught.value) == text
+
+
+@pytest.mark.parametrize("is_column", [True, False])
+def test_first_pixels_beyond_the_image_are_refused(is_column):
+    cameras = Cameras(**GOOD)
+    width, height = cameras.width, cameras.height
+    assert len(cameras.every(1000, first=(width - 1, height - 1))) == len(cameras)
+    wish = f"a column from 0 to {width - 1} and a row from 0 to {height - 1}"
+    with pytest.raises(InvalidArgumentError, match=f"^first must be {wish}, found"):
+        cameras.every(1000, first=(width, 0) if is_column else (0, height))
 
 
 @pytest.mark.parametrize(

@@ -192,7 +192,7 @@ class Cameras:
 
         Args:
             stride: Step between pixels, along rows and columns.
-            first: Column and row of the first pixel, each below the stride.
+            first: Column and row of the first pixel, each below the stride and in the image.
 
         Returns:
             Cameras of smaller images.
@@ -202,14 +202,14 @@ class Cameras:
         """
         stride = checked_whole(stride, "stride")
         starts = tuple(map(whole_number, first)) if isinstance(first, Sequence) else ()
-        if len(starts) != 2 or not all(0 <= start < stride for start in starts):
+        sides = self.width, self.height
+        ends = [min(stride, side) for side in sides]
+        if len(starts) != 2 or not all(0 <= at < end for at, end in zip(starts, ends, strict=True)):
             raise InvalidArgumentError(
-                f"first must be a column and a row from 0 to {stride - 1}, found {shown(first)}."
+                f"first must be a column from 0 to {ends[0] - 1} and a row from 0 to "
+                f"{ends[1] - 1}, found {shown(first)}."
             )
-        width, height = (
-            -((starts[0] - self.width) // stride),
-            -((starts[1] - self.height) // stride),
-        )
+        width, height = (-((at - side) // stride) for at, side in zip(starts, sides, strict=True))
         return self._strided(stride, self.Ks.new_tensor([starts]), width=width, height=height)
 
     def interleaved(self, stride: int) -> Self:

@@ -40,7 +40,7 @@ def read_count(text: str) -> int:
 
 
 def target_count(
-    total: int, rho: float | None, *, count: int | None = None, max_count: int | None = None
+    total: int, rho: float | None = None, *, count: int | None = None, max_count: int | None = None
 ) -> int:
     """Return the number of Gaussians to keep.
 

@@ -98,8 +98,8 @@ class LocalWorkers:
         self._pool = ProcessPoolExecutor(
             self._count, context, initializer=_begin, initargs=(self._watched, threads)
         )
-        for _ in range(self._count):  # they start while this process reads the sample
-            self._pool.submit(os.getpid)
+        # They start while this process reads the sample.
+        self._starts = [self._pool.submit(os.getpid) for _ in range(self._count)]
         return self
 
     def __exit__(
@@ -142,6 +142,11 @@ class LocalWorkers:
                 result: Result = pickle.loads(futures.popleft().result())
                 yield result
         except BrokenProcessPool as error:
+            if all(start.done() and start.exception() for start in self._starts):
+                raise RunError(
+                    "no worker process could start; a script that starts some must be a file, and "
+                    'guard its main code with `if __name__ == "__main__":`.'
+                ) from error
             raise RunError(
                 f"a worker process ended unexpectedly, most likely for lack of memory; run the "
                 f"same command again, {self._remedy}."

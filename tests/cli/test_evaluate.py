@@ -233,3 +233,33 @@ def test_compare_shows_at_most_eight_cameras(folder, scenes, tmp_path, capsys):
     assert main(["compare", *scenes[:2], "-o", str(tmp_path), *words]) == 0
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert page.count("images/") == 8
+
+
+@pytest.fixture
+def away(tmp_path):
+    """Cameras that look away from the scene."""
+    pose = [[1, 0, 0, 0], [0, 1, 0, -1], [0, 0, 1, -5], [0, 0, 0, 1]]
+    frames = [{"file_path": f"{n}.png", "transform_matrix": pose} for n in range(2)]
+    document = {"w": 64, "h": 48, "fl_x": 60.0, "frames": frames}
+    (tmp_path / "away.json").write_text(json.dumps(document))
+    return str(tmp_path / "away.json")
+
+
+def test_images_that_show_nothing_are_a_warning(folder, scenes, away, tmp_path, capsys):
+    for cameras, text in (
+        (str(folder), ""),
+        (away, "warning: no image shows anything of full.ply"),
+    ):
+        words = ["render", scenes[0], "-o", str(tmp_path / "images"), "--cameras", cameras]
+        assert main([*words, "--size", "32", "--overwrite"]) == 0
+        assert text in capsys.readouterr().err
+        assert not text or len(list((tmp_path / "images").glob("*.png"))) == 9
+
+
+def test_levels_are_not_made_if_the_cameras_that_score_them_see_nothing(
+    scenes, away, tmp_path, capsys
+):
+    words = ["levels", scenes[0], "-o", str(tmp_path / "out"), "--rho", "0.1", "--cameras", away]
+    assert main(words) == 1
+    assert "the cameras must see full.ply, found nothing of it" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -1,8 +1,16 @@
-"""Numbers in words on sheets and pages."""
+"""Numbers and names on sheets and pages, in JSON and in errors."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
-from cvtgs.evaluation import comparison_files
+from cvtgs import Cameras, evaluate, refine
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.evaluation import EvaluationSettings, compare, comparison_files
+from refine_cases import ring
+from scenes import random_scene
 
 
 @pytest.mark.parametrize(
@@ -18,3 +26,28 @@ from cvtgs.evaluation import comparison_files
 )
 def test_ratios_as_text(ratio, text):
     assert vars(comparison_files)["_ratio_text"](ratio) == text
+
+
+def test_names_of_images_that_are_not_utf_8_are_escaped() -> None:
+    names = ("Geb\udce4ude.png", "two\nlines.png", "Geb\xe4ude.png")
+    scene, cameras = random_scene(30), replace(ring(3), names=names)
+    found = evaluate(scene, {"a": scene}, cameras, settings=EvaluationSettings(lpips="off"))
+    wanted = ["Geb\\udce4ude.png", "two\\nlines.png", "Geb\xe4ude.png"]
+    assert json.loads(found.to_json())["views"] == wanted
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda scene, cameras: evaluate(scene, {"a": scene}, cameras),
+        lambda scene, cameras: compare(scene, {"a": scene}, cameras),
+        lambda scene, cameras: refine(scene, scene, cameras=cameras),
+    ],
+)
+def test_a_wrong_camera_is_named_by_its_number(use: Callable[..., object]) -> None:
+    cameras = ring(9)
+    viewmats = cameras.viewmats.clone()
+    viewmats[5] *= float("nan")
+    wrong = Cameras(viewmats=viewmats, Ks=cameras.Ks, width=64, height=64)
+    with pytest.raises(InvalidArgumentError, match=r"; 1 of 9 do not, the first is camera 5\.$"):
+        use(random_scene(30), wrong)

@@ -200,3 +200,16 @@ def test_a_process_that_may_not_start_others_says_so(monkeypatch):
     monkeypatch.setitem(vars(multiprocessing.current_process())["_config"], "daemon", True)
     with pytest.raises(RunError, match=r"multiprocessing\.Pool may not start others; use"):
         LocalWorkers(2).__enter__()
+
+
+def test_a_script_without_a_guard_is_told_why_no_process_starts(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text("""
+from cvtgs.outofcore import LocalWorkers
+with LocalWorkers(1) as workers:
+    print(list(workers(abs, [-1])))
+""")
+    run = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert run.returncode == 1
+    last = run.stderr.strip().splitlines()[-1]
+    assert last.startswith("cvtgs.errors.RunError: no worker process could start; a script that")

@@ -316,3 +316,10 @@ def test_a_scene_whose_valid_rows_all_stay_is_not_refined():
         report = simplifier.run(scene.with_tensors({"means": means}, {}), count=39).report
     assert report.refinement is None
     assert report.views == "none"
+
+
+def test_a_count_needs_no_ratio():
+    assert target_count(100, count=5) == 5
+    assert target_count(100, max_count=500) == 100
+    with pytest.raises(InvalidArgumentError, match="give one of rho, count and max_count, found n"):
+        target_count(100)

@@ -20,7 +20,7 @@ from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped
 from cvtgs.cli.jobs import expanded
 from cvtgs.cli.options import CAMERA_FILES, AddParser, add_options, read_words
 from cvtgs.cli.view import PAGE, check_page, write_page
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import InvalidArgumentError, warn
 from cvtgs.io.atomic import windows_fault, write_atomically
 from cvtgs.progress import ProgressEvent
 from cvtgs.text import MOST_LETTERS, counted, printable_name, size_text
@@ -57,6 +57,7 @@ def render(options: argparse.Namespace) -> None:
 
     from cvtgs.devices import chosen_device
     from cvtgs.evaluation.images import as_bytes, encode
+    from cvtgs.evaluation.scorer import LEAST_COVER
     from cvtgs.io.atomic import make_folder
 
     check_view_options(options)
@@ -68,17 +69,25 @@ def render(options: argparse.Namespace) -> None:
     paths = [options.output / name for name in file_names(cameras.view_names)]
     for path in paths:
         cvtgs.io.check_output(path, options.overwrite)
+    most_seen = 0.0
     with progress_bars(quiet=options.quiet) as listener, torch.no_grad():
         for number, (path, camera) in enumerate(zip(paths, cameras.singles(), strict=True)):
             listener(ProgressEvent(stage="render", done=number, total=len(paths)))
-            image = cvtgs.render(
+            found = cvtgs.render(
                 scene,
                 camera,
                 backend=options.backend,
                 background=background_color(options),
-            ).rgb[0]
-            write_atomically(path, encode(as_bytes(image), "png"), overwrite=options.overwrite)
+            )
+            most_seen = max(most_seen, float(found.alpha.mean()))
+            png = encode(as_bytes(found.rgb[0]), "png")
+            write_atomically(path, png, overwrite=options.overwrite)
         listener(ProgressEvent(stage="render", done=len(paths), total=len(paths)))
+    if most_seen < LEAST_COVER:
+        warn(
+            f"no image shows anything of {options.input.name}; are these cameras of this scene, in "
+            f"its axes and units?"
+        )
     if not options.quiet:
         images = counted(len(paths), "image")
         say(f"{images} of {cameras.width} x {cameras.height} pixels in {options.output}")

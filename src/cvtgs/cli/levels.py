@@ -79,6 +79,8 @@ def add_levels(add_parser: AddParser) -> None:
 
 def levels(options: argparse.Namespace) -> None:
     """Run ``cvtgs levels``."""
+    from cvtgs.evaluation.scorer import check_seen
+
     check_view_options(options)
     axes = read_axes(options.axes)
     default = PLAIN_RHOS if options.stream is None else STREAM_RHOS
@@ -113,6 +115,8 @@ def levels(options: argparse.Namespace) -> None:
         if cameras is None and axes.source is None and config.uses_images:
             own = cvtgs.views.find_own_cameras(scene, options.input)
             cameras = None if own is None else own.cameras
+        if is_scored and options.cameras is not None:  # before the long work
+            check_seen(scene, choose_cameras(options, scene), name=options.input.name)
         made = simplifier.levels(scene, rhos, cameras=cameras)
         if options.stream is not None:
             stream_levels(options, made, axes, listener)

@@ -28,7 +28,7 @@ from cvtgs.evaluation.scorer import (
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.rendering import choose_backend
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
-from cvtgs.text import shown
+from cvtgs.text import printable_name, shown
 
 STAGE = "evaluate"  # stage name in progress events; one step per image
 ROUNDING = 1e-3  # values of photographs may be outside [0, 1] by this much, as in half precision
@@ -292,7 +292,7 @@ def _score_images(
     return Evaluation(
         reference=reference_name,
         reference_count=len(reference),
-        views=cameras.view_names,
+        views=tuple(map(printable_name, cameras.view_names)),  # those of other systems, too
         width=cameras.width,
         height=cameras.height,
         backend=choose_backend(settings.backend, reference.device)[0],

@@ -16,6 +16,7 @@ from cvtgs.evaluation.lpips import LEAST_PIXELS, LpipsNetwork, LpipsWeights, loa
 from cvtgs.evaluation.metrics import alpha_bias, alpha_error, pair_psnr, ssim
 from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.rendering import BackendName, render
+from cvtgs.rendering.projection import to_matrices
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
 
@@ -243,7 +244,8 @@ def render_views(
 def check_seen(
     scene: GaussianScene, cameras: Cameras, *, name: str, backend: BackendName = "auto"
 ) -> None:
-    """Raise if no camera sees anything of a scene."""
+    """Raise if no camera sees anything of a scene, or one is no pinhole camera."""
+    to_matrices(cameras)  # alone, each would be "camera 0" in errors
     is_drawn = scene.opacities >= MIN_ALPHA
     if cameras.shows_any(scene.means[is_drawn] if bool(is_drawn.any()) else scene.means):
         return
