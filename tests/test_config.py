@@ -346,3 +346,19 @@ def test_presets_cannot_be_changed():
         PRESETS["fast"]["seed"] = 5
     with pytest.raises(TypeError, match="does not support item assignment"):
         PRESETS["matched"]["refine"]["rates"]["means"] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "renders", "shares"),
+    [
+        ({}, True, True),
+        ({"match": {"opacity_rounds": 0}}, True, False),
+        ({"effects": {"visibility": "off"}}, False, False),
+    ],
+)
+def test_what_images_are_rendered_for(
+    changes: dict[str, dict[str, object]], renders: bool, shares: bool
+) -> None:
+    config = SimplifyConfig.from_mapping({"preset": "matched", **changes})
+    assert (config.uses_renders, config.shares_images) == (renders, shares)
+    assert config.uses_images

@@ -274,3 +274,12 @@ def test_merged_scenes_keep_their_sh_bands_and_get_zeros_above() -> None:
     assert torch.equal(both.shN[:3, :3], first.shN)
     assert not both.shN[:3, 3:].any()
     assert torch.equal(both.shN[3:], second.shN)
+
+
+def test_scenes_of_several_layouts_merge_to_one_of_none() -> None:
+    """Else a layout without a third scale would drop those of the other scene."""
+    flat = replace(random_scene(3), layout=(("scale_0", "float"), ("scale_1", "float")))
+    thick = replace(random_scene(2), layout=(*flat.layout, ("scale_2", "float")))
+    for scenes in ([flat, thick], [thick, flat]):
+        assert (merge(scenes).layout, merge(scenes).has_two_scales) == ((), False)
+    assert merge([flat, flat]).layout == flat.layout

@@ -13,7 +13,7 @@ from cvtgs.analysis import analyze
 from cvtgs.cli.main import main
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
 from cvtgs.evaluation.scorer import ImageScores, scene_scores
-from cvtgs.levels import LevelEntry, LevelsIndex, level_names, write_levels
+from cvtgs.levels import LevelEntry, LevelsIndex, check_levels, level_names, write_levels
 from scenes import random_scene, same_bits
 
 RHOS = [0.2, 0.04, 0.004]
@@ -233,3 +233,9 @@ def test_boxes_of_levels_are_in_the_axes_of_their_files(tmp_path) -> None:
     stored = cvtgs.load(tmp_path / "rho_0.5.glb", axes="rdf").means  # the numbers in the file
     assert list(index.levels[0].box_min) == stored.amin(dim=0).tolist()
     assert list(index.levels[0].box_max) == stored.amax(dim=0).tolist()
+
+
+def test_a_format_that_cannot_be_read_is_refused_in_capitals_too(tmp_path: Path) -> None:
+    with pytest.raises(InvalidArgumentError, match=r"found '\.usda'"):
+        check_levels(tmp_path / "out", ["rho_0.1.USDA"])
+    assert not (tmp_path / "out").exists()

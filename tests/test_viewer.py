@@ -78,6 +78,11 @@ def test_the_page_starts_with_the_simplified_scene(page: Any) -> None:
     assert control(page, "show").options == ("simplified", "full scene", "other.ply")
 
 
+def test_an_ipv6_host_is_in_brackets(page: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page.stand, "host", "::1")
+    assert page.server.address == "http://[::1]:8080"
+
+
 @pytest.mark.slow
 def test_moving_the_slider_shows_the_simplified_scene(page: Any, scene: GaussianScene) -> None:
     control(page, "log10 of rho").value = -2.0

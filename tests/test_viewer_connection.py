@@ -85,6 +85,15 @@ def test_on_an_address_of_the_network_any_page_may_connect(library: Library) -> 
     assert answer(library, {"Host": "my-machine.lan:8080"}) == OWN
 
 
+@pytest.mark.parametrize("host", ["my-machine:8080", "127.0.0.2:8080", "localhost:8080"])
+def test_a_named_machine_may_also_be_opened_by_its_address(
+    library: Library, host: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cvtgs.viewer.connection._address_of", lambda name: "127.0.0.2")
+    start_server("My-Machine", 8080)
+    assert answer(library, {"Host": host, "Origin": f"http://{host}"}) == OWN
+
+
 def test_other_servers_of_the_process_stay_as_they_are(library: Library) -> None:
     before = library.serve
     start_server("localhost", 8080)

@@ -1,13 +1,15 @@
 """The cost model: rates fitted to seconds, and what they predict; all seconds are made up."""
 
 import math
+from pathlib import Path
 
 import pytest
 
 from cvtgs import SimplifyConfig
 from cvtgs.budget import CostModel, Work, choose_preset, cost_model, shipped_model
-from cvtgs.budget.calibrate import TRIALS, Trial, calibrate
+from cvtgs.budget.calibrate import TRIALS, Trial, calibrate, undisturbed_seconds
 from cvtgs.budget.costs import Measurement, fit_rates
+from cvtgs.clock import StageCost
 from cvtgs.errors import InvalidArgumentError
 
 
@@ -208,3 +210,33 @@ def test_a_first_run_that_is_faster_than_all_later_ones_costs_no_start():
     trials = [Trial(preset="draft", kind="object", count=50, sh_degree=0, rho=0.1)]
     model = calibrate(run, trials=trials, prior=CostModel(rates={}), clock=lambda: 0.0)
     assert model.start == 0.0
+
+
+@pytest.mark.parametrize(("device_bytes", "seconds"), [(0, 2.0), (1, 5.0)])
+def test_only_a_stage_on_the_cpu_takes_no_longer_than_its_cpu_seconds(
+    device_bytes: int, seconds: float
+) -> None:
+    """On a GPU, the process waits for its kernels."""
+    cost = StageCost(
+        stage="merge",
+        seconds=5.0,
+        cpu_seconds=2.0,
+        peak_memory_bytes=0,
+        peak_device_memory_bytes=device_bytes,
+    )
+    assert undisturbed_seconds(cost) == seconds
+
+
+def test_another_number_of_threads_is_measured_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured: list[int] = []
+    for threads in (1, 2, 2):
+        monkeypatch.setattr("torch.get_num_threads", lambda count=threads: count)
+
+        def calibration(count: int = threads) -> CostModel:
+            measured.append(count)
+            return shipped_model()
+
+        cost_model("cpu", calibration=calibration, folder=tmp_path)
+    assert measured == [1, 2]

@@ -3,8 +3,10 @@
 import argparse
 import re
 import shutil
+import time
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
@@ -13,7 +15,7 @@ from cvtgs.budget import CostModel, Found
 from cvtgs.budget.calibrate import CANDIDATES
 from cvtgs.budget.costs import FEATURES
 from cvtgs.cli.display import target_note
-from cvtgs.cli.goals import STARTED, check_goals, choose_preset
+from cvtgs.cli.goals import STARTED, check_goals, choose_preset, search_target
 from cvtgs.cli.main import build_parser, main
 from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.progress import silent
@@ -265,3 +267,32 @@ def test_several_scenes_measure_the_machine_once(source, tmp_path, measured):
         == 0
     )
     assert measured == [True, False]
+
+
+@pytest.mark.usefixtures("measured")
+def test_a_preset_fits_into_what_start_and_reading_left(scene: cvtgs.GaussianScene) -> None:
+    """Of 8 s, 6 s are over; the preset that takes 4 s would fit into 8 s."""
+    known = options("--rho", "0.1", "--time-budget", "8s")
+    known.begun = time.perf_counter() - 6.0
+    assert choose_preset(known, scene, {}, silent).name != "high"
+
+
+@pytest.mark.parametrize(("name", "is_read_back"), [("a.ply", False), ("a.splat", True)])
+@pytest.mark.parametrize(("preset", "views"), [("draft", "the given ones"), ("matched", None)])
+def test_a_target_is_measured_on_the_file_and_over_views_that_nothing_was_fitted_to(
+    scene: cvtgs.GaussianScene,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    name: str,
+    is_read_back: bool,
+    preset: str,
+    views: str | None,
+) -> None:
+    given: dict[str, Any] = {}
+    monkeypatch.setattr("cvtgs.budget.find_count", lambda _, **options: given.update(options))
+    known, cameras = options("--target-psnr", "20"), cast("Any", "the given ones")
+    known.output = Path(name)
+    simplifier = cvtgs.Simplifier(preset=preset, device="cpu")
+    search_target(known, scene, simplifier, cameras=cameras, axes=None, listener=silent)
+    assert (given["cameras"], given["heldout"]) == (cameras, views)
+    assert (given["written"](scene) is not scene) == is_read_back

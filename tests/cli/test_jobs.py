@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import cvtgs
+from cvtgs.cli import jobs
 from cvtgs.cli.main import main
 from cvtgs.text import size_text
 from format_cases import DATA
@@ -66,6 +67,32 @@ def test_a_folder_is_expanded_to_the_scenes_in_it(
     }
     assert main(["convert", "none", "-o", "out"]) == 1
     assert "none: must be a file or the folder of a trained model" in capsys.readouterr().err
+
+
+def test_the_last_line_adds_the_sizes_of_all_scenes(
+    scenes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["convert", *NAMES, "-o", "out", "--suffix", ".splat"]) == 0
+    before = sum((scenes / name).stat().st_size for name in NAMES)
+    after = sum(path.stat().st_size for path in Path("out").iterdir())
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == f"3 scenes in out, {size_text(before)} -> {size_text(after)}"
+
+
+def test_the_name_of_a_folder_is_no_pattern(scenes: Path) -> None:
+    (scenes / "scans [1]").mkdir()
+    (scenes / "a.ply").rename(scenes / "scans [1]" / "a.ply")
+    assert main(["convert", "scans [1]", "-o", "out", "--quiet"]) == 0
+    assert [path.name for path in Path("out").iterdir()] == ["a.ply"]
+
+
+@pytest.mark.parametrize("given", [".", "meta.json", "lod-meta.json"])
+def test_a_folder_that_is_a_scene_names_the_output(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str
+) -> None:
+    (tmp_path / "room").mkdir()
+    monkeypatch.chdir(tmp_path / "room")
+    assert vars(jobs)["_output_name"](Path(given), None) == "room.ply"
 
 
 def test_the_suffix_of_levels_needs_no_dot(scenes: Path) -> None:

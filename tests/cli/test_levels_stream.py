@@ -55,6 +55,7 @@ def test_an_environment_is_mentioned_only_if_there_is_one(
         (["--chunk", "300"], "--chunk needs --stream."),
         (["--stream", "3dtiles", "--environment", "9"], "and needs --stream sog; found 9."),
         (["--stream", "sog", "--environment", "-1"], "--environment must be above 0"),
+        (["--stream", "sog", "--environment", "inf"], "--environment must be above 0"),
         (["--memory", "2GB"], "--memory needs --stream."),
         (["--stream", "sog", "--place", "8,47"], "--place and --transform need --stream 3dtiles."),
         (

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import cvtgs
-from cvtgs.cli.display import report_notes
+from cvtgs.cli.display import TIE, report_notes, say_wrapped
 from cvtgs.cli.main import main
 from cvtgs.report import MatchReport, SimplifyReport
 from scenes import random_scene
@@ -232,3 +232,10 @@ def test_formats_that_change_protected_gaussians_are_mentioned(
     said = printed(capsys, "simplify", source, source.with_name(name), *words)
     assert "in the boxes of --keep" in said
     assert ("Only a plain .ply has them first" in said) == is_said
+
+
+def test_words_that_stay_together_have_an_ordinary_space(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    say_wrapped(f"{'x' * 76} 12{TIE}s")
+    assert capsys.readouterr().out == f"{'x' * 76}\n  12 s\n"

@@ -269,7 +269,13 @@ def test_zero_distortion_gives_no_warning(tmp_path) -> None:
     assert len(load_cameras(tmp_path / "a")) == len(load_cameras(tmp_path / "b"))
 
 
-@pytest.mark.parametrize("given", [{"k1": 0.01}, {"distortion_params": [0, 0.01, 0, 0, 0, 0]}])
+@pytest.mark.parametrize(
+    "given",
+    [
+        *({name: -0.01} for name in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")),
+        {"distortion_params": [0, 0.01, 0, 0, 0, 0]},
+    ],
+)
 def test_distortion_in_transforms_json_is_warned_about(given, tmp_path) -> None:
     document = {**transforms(), "distortion_params": [0.0] * 6}
     document["frames"][2] |= given

@@ -111,7 +111,8 @@ def test_a_bound_of_0_stands_for_the_usual_one(
             struct.pack("<I", 701),
             "the sections must hold the 701 Gaussians that the header promises",
         ),
-        (4096, struct.pack("<I", 1 << 30), "a section of 1,073,741,824 Gaussians must take"),
+        (4096, struct.pack("<I", 1 << 30), "with room for 703 Gaussians must not hold more, found"),
+        (4096 + 4, struct.pack("<I", 699), "with room for 699 Gaussians must not hold more, found"),
         (4096 + 12, struct.pack("<I", 1 << 30), "a section of 700 Gaussians must take"),
         (4096 + 32, struct.pack("<I", 1), "buckets of a section must hold its 700 Gaussians"),
         (4096 + 40, struct.pack("<H", 3), "must have an SH degree of at most 2, found 3"),
@@ -124,6 +125,31 @@ def test_damage_is_one_sentence(tmp_path: Path, place: int, number: bytes, text:
     with pytest.raises(FileFormatError) as caught:
         cvtgs.load(path)
     assert text in str(caught.value)
+
+
+def test_a_file_without_gaussians_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="and at least one, found 0"):
+        cvtgs.load(write(tmp_path / "a.ksplat", 1))
+
+
+def test_a_gaussian_in_no_bucket_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.ksplat", 1, section(1, 0, 200, seed=1))
+    content = path.read_bytes()
+    path.write_bytes(content[:8192] + struct.pack("<I", 29) + content[8196:])
+    with pytest.raises(FileFormatError, match="2 buckets of a section must hold its 200 Gaussians"):
+        cvtgs.load(path)
+
+
+@pytest.mark.parametrize(("stated", "ratio"), [(0, 1.0), (16383, 32767 / 16383)])
+def test_a_section_may_state_the_range_of_its_positions(
+    tmp_path: Path, stated: int, ratio: float
+) -> None:
+    """It is half of the number of steps in a block; 0 stands for the usual one."""
+    path = write(tmp_path / "a.ksplat", 1, section(1, 0, 300, seed=1))
+    before, content = cvtgs.load(path).means, path.read_bytes()
+    path.write_bytes(content[:4120] + struct.pack("<I", stated) + content[4124:])
+    found = cvtgs.load(path).means
+    torch.testing.assert_close(found[1] - found[0], ratio * (before[1] - before[0]))
 
 
 def test_a_huge_bucket_size_takes_no_memory(tmp_path: Path) -> None:

@@ -70,6 +70,48 @@ def test_more_writers_than_names_can_write(tmp_path: Path, monkeypatch: pytest.M
     assert list(tmp_path.iterdir()) == [path]
 
 
+@posix
+def test_a_temporary_file_that_another_run_took_for_a_leftover_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may do so between the creation of the file and its lock."""
+    lock, removed = vars(atomic)["_lock"], list[str]()
+
+    def late(descriptor: int) -> bool:
+        if not removed:
+            removed.extend(leftovers(tmp_path))
+            (tmp_path / removed[0]).unlink()
+        return bool(lock(descriptor))
+
+    monkeypatch.setattr(atomic, "_lock", late)
+    write(tmp_path / "a.bin")
+    assert removed == [".a.bin.0.tmp"]
+    assert (tmp_path / "a.bin").read_bytes() == b"new"
+
+
+@posix
+def test_a_file_that_took_the_name_of_a_leftover_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other run may begin between the search for leftovers and their lock."""
+    path = tmp_path / ".a.bin.0.tmp"
+    path.write_bytes(b"left over")
+
+    def replaced(descriptor: int, operation: int) -> None:
+        path.unlink()
+        path.write_bytes(b"of another run")
+
+    monkeypatch.setattr("fcntl.flock", replaced)
+    vars(atomic)["_remove_leftover"](path)
+    assert path.read_bytes() == b"of another run"
+
+
+@posix
+def test_a_missing_folder_is_refused_even_if_the_path_leads_out_of_it(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="must be in an existing directory"):
+        check_output(tmp_path / "missing" / ".." / "a.ply")
+
+
 def test_without_locks_only_old_leftovers_are_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -107,6 +149,7 @@ def test_a_loop_of_symbolic_links_is_refused_before_the_work(tmp_path: Path) -> 
         ("nul", "a device"),
         (r"D:\CON.ply", "a device"),
         ("com1.tar.ply", "a device"),
+        ("con .ply", "a device"),
         ("a.ply.", "a dot or space"),
         ("a.ply ", "a dot or space"),
     ],

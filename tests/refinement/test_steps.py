@@ -35,6 +35,23 @@ def test_the_loss_of_a_step_is_the_mean_over_its_images():
     torch.testing.assert_close(*losses)
 
 
+def test_images_of_all_sizes_weigh_the_same_in_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of four images, three have one size and one has another."""
+    full, small = full_scene(200), small_scene(full_scene(200))
+    views = three_views()
+    views = replace(views, training=iter([*views.training, ring(1, width=20, height=16)]))
+    config = quick(images_per_step=4, first_images=4, steps_per_image=100)
+    images = ImageBuffer(full, views, config=config, seed=0)
+    monkeypatch.setattr(images, "draw_backgrounds", lambda count: torch.zeros(count, 3))
+    drawn, losses = images.draw_step(), list[torch.Tensor]()
+    for some in (drawn, drawn[:1], drawn[1:]):
+        monkeypatch.setattr(images, "draw_step", lambda some=some: some)
+        count = sum(len(one.rgb) for one in some)
+        of_these = config.model_copy(update={"images_per_step": count})
+        losses.append(mean_loss(small, images, of_these))
+    torch.testing.assert_close(losses[0], (3 * losses[1] + losses[2]) / 4)
+
+
 def test_backgrounds_are_random_and_seeded():
     full = full_scene(50)
     buffers = [ImageBuffer(full, three_views(), config=quick(), seed=seed) for seed in (0, 0, 1)]
@@ -62,6 +79,11 @@ def test_few_gaussians_get_more_steps_of_fewer_pixels(count, thinning, times):
     never = config.model_copy(update={"lengthening": 1.0})
     assert never.thinning(count) == 1
     assert never.for_count(count) == never
+
+
+def test_two_and_a_half_pixels_along_a_side_are_enough_to_thin_steps() -> None:
+    config = RefineConfig(size=250, lengthening=4)
+    assert [config.thinning(count) for count in (10_000, 10_001)] == [2, 1]
 
 
 @pytest.mark.parametrize("stride", [1, 2])

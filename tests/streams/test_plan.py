@@ -21,7 +21,7 @@ from cvtgs.streams import (
     write_sog_stream,
     write_tiles,
 )
-from cvtgs.streams.plan import near_rows, plan_part
+from cvtgs.streams.plan import environment_level, near_rows, plan_part
 from scenes import random_scene
 
 
@@ -58,6 +58,18 @@ def test_parts_of_about_equally_many_fine_gaussians():
     chunks = planned(fine, coarse, most=9).chunks
     assert [own.rows[1].tolist() for own in chunks] == [[0, 1, 2], [3]]
     assert [len(own.rows[0]) for own in chunks] == [3, 9]
+
+
+@pytest.mark.parametrize(("most", "chunks"), [(4, 1), (3, 2)])
+def test_a_chunk_may_hold_as_many_gaussians_as_given(most: int, chunks: int) -> None:
+    fine, coarse = level([0.0, 1, 2, 3], None), level([0.0, 2], [0, 0, 1, 1])
+    assert len(planned(fine, coarse, most=most).chunks) == chunks
+
+
+def test_a_gaussian_that_the_coarsest_level_left_out_is_in_the_nearest_chunk() -> None:
+    fine, coarse = level([0.0, 6.0, 10.0], None), level([0.0, 10.0], [0, -1, 1])
+    first, second = planned(fine, coarse, most=2).chunks
+    assert (first.rows[0].tolist(), sorted(second.rows[0].tolist())) == ([0], [1, 2])
 
 
 def test_gaussians_that_the_coarsest_level_left_out_take_no_quadratic_time():
@@ -145,6 +157,10 @@ def test_all_parts_have_their_environment_at_one_level(
     ]
     assert vars(sog)["_far_files"](parts) == files
     assert vars(sog)["_far_files"](parts[1:2]) == []
+
+
+def test_no_environment_is_of_a_level_without_far_gaussians() -> None:
+    assert environment_level([0, 3]) == 1
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Sources: scenes for training, scenes for validation, and variants made of them."""
 
+import math
 import random
 from dataclasses import replace
 
@@ -275,3 +276,17 @@ def test_a_file_that_is_too_large_to_be_used_is_named(tmp_path):
     with pytest.warns(UserWarning, match=r"large\.ply: not used for training, since 200 Gaussians"):
         sources = find_sources(config, seed=0)
     assert names_of(sources, is_validation=False) == ["a"]
+
+
+def test_the_gaussians_of_a_thinned_copy_grow_to_fill_its_space(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Half of them, so each has twice the volume; nothing is stretched."""
+    rng = random.Random(0)
+    monkeypatch.setattr(rng, "uniform", lambda low, high: 0.5 if low == 0.4 else 1.0)
+    scene = random_scene(200)
+    copy = perturb(scene, rng)
+    kept = scene.select(torch.isin(scene.means[:, 0], copy.means[:, 0]))
+    assert 60 < len(copy) == len(kept) < 140
+    grown = copy.log_scales.sum(dim=1) - kept.log_scales.sum(dim=1)
+    torch.testing.assert_close(grown, torch.full_like(grown, math.log(2.0)), rtol=0, atol=1e-3)

@@ -191,7 +191,12 @@ def _read_section(
 ) -> Arrays:
     left = os.fstat(file.fileno()).st_size - file.tell()
     needed = section.extra_bytes + row.itemsize * section.used
-    if section.used > section.room or needed > left:
+    if section.used > section.room:
+        raise FileFormatError(
+            f"{path}: a section with room for {section.room:,} Gaussians must not hold more, "
+            f"found {section.used:,}."
+        )
+    if needed > left:
         raise FileFormatError(
             f"{path}: a section of {section.used:,} Gaussians must take {needed:,} bytes, "
             f"found {left:,}."

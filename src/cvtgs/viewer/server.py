@@ -238,7 +238,9 @@ class ViewerServer:
     @property
     def address(self) -> str:
         """URL of the page."""
-        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+        host = self._server.get_host()
+        host = f"[{host}]" if ":" in host else host  # IPv6
+        return f"http://{host}:{self._server.get_port()}"
 
     def wait(self) -> None:
         """Serve until the process is interrupted or the server is closed."""
