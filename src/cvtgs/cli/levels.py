@@ -79,8 +79,6 @@ def add_levels(add_parser: AddParser) -> None:
 
 def levels(options: argparse.Namespace) -> None:
     """Run ``cvtgs levels``."""
-    from cvtgs.evaluation.scorer import check_seen
-
     check_view_options(options)
     axes = read_axes(options.axes)
     default = PLAIN_RHOS if options.stream is None else STREAM_RHOS
@@ -115,8 +113,8 @@ def levels(options: argparse.Namespace) -> None:
         if cameras is None and axes.source is None and config.uses_images:
             own = cvtgs.views.find_own_cameras(scene, options.input)
             cameras = None if own is None else own.cameras
-        if is_scored and options.cameras is not None:  # before the long work
-            check_seen(scene, choose_cameras(options, scene), name=options.input.name)
+        if is_scored and options.cameras is not None:
+            _check_seen(options, scene)
         made = simplifier.levels(scene, rhos, cameras=cameras)
         if options.stream is not None:
             stream_levels(options, made, axes, listener)
@@ -157,6 +155,14 @@ def _check_input(options: argparse.Namespace, names: Sequence[str]) -> None:
                 f"{options.output / name}: a level must not replace the scene; choose another "
                 f"folder."
             )
+
+
+def _check_seen(options: argparse.Namespace, scene: "GaussianScene") -> None:
+    """Raise before the long work if the cameras that are to score see nothing."""
+    from cvtgs.evaluation.scorer import check_seen
+
+    full = cvtgs.validity.valid_part(scene)
+    check_seen(full, choose_cameras(options, full), name=options.input.name)
 
 
 def _score(

@@ -292,7 +292,7 @@ def _score_images(
     return Evaluation(
         reference=reference_name,
         reference_count=len(reference),
-        views=tuple(map(printable_name, cameras.view_names)),  # those of other systems, too
+        views=tuple(map(printable_name, cameras.view_names)),  # JSON is UTF-8
         width=cameras.width,
         height=cameras.height,
         backend=choose_backend(settings.backend, reference.device)[0],
