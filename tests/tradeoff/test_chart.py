@@ -4,35 +4,17 @@ from collections.abc import Sequence
 
 import pytest
 
-from cvtgs import SimplifyConfig, SimplifyReport
 from cvtgs.evaluation import Evaluation
 from cvtgs.plots import Panel
 from cvtgs.tradeoff.files import HEIGHT, WIDTH, tradeoff_chart
-from cvtgs.tradeoff.results import Tradeoff, TradeoffResult, with_fronts
-
-
-def result(preset: str, rho: float, seconds: float, psnr: float, ssim: float) -> TradeoffResult:
-    return TradeoffResult(
-        name=f"{preset} {rho:g}",
-        preset=preset,
-        rho=rho,
-        count=50,
-        bytes=4200,
-        seconds=seconds,
-        peak_memory_bytes=0,
-        psnr=psnr,
-        ssim=ssim,
-        report=SimplifyReport(
-            input_count=500, output_count=50, target_count=50, rho=rho, config=SimplifyConfig()
-        ),
-    )
-
+from cvtgs.tradeoff.results import Tradeoff, with_fronts
+from tradeoff_cases import result
 
 MADE = (
-    result("high", 0.1, 9.0, 25.0, 0.8),
-    result("draft", 0.1, 2.0, 20.0, 0.7),
-    result("fast", 0.1, 3.0, 19.0, 0.75),
-    result("draft", 0.01, 0.0, 15.0, 0.5),
+    result("high", 9.0, 25.0, ssim=0.8),
+    result("draft", 2.0, 20.0, ssim=0.7),
+    result("fast", 3.0, 19.0, ssim=0.75),
+    result("draft", 0.0, 15.0, 0.01, ssim=0.5),
 )
 
 

@@ -16,10 +16,8 @@ import torch
 
 import cvtgs
 from browser_cases import attribute, dom, layout_on_a_phone, needs_browser
-from cvtgs.clock import StageCost
 from cvtgs.errors import ConfigError, InvalidArgumentError, RunError
 from cvtgs.evaluation import Evaluation, EvaluationSettings, SceneScores, Score, compare
-from cvtgs.report import SimplifyReport
 from cvtgs.tradeoff import (
     Failure,
     Measured,
@@ -46,33 +44,7 @@ from cvtgs.tradeoff.measure import (
 )
 from cvtgs.tradeoff.results import on_front, with_fronts
 from cvtgs.views import automatic_views
-
-
-def result(preset: str, seconds: float, psnr: float, rho: float = 0.1, **more) -> TradeoffResult:
-    stages = tuple(
-        StageCost(stage=name, seconds=part, cpu_seconds=part, peak_memory_bytes=2**28)
-        for name, part in {"check": 0.25, **more.pop("stages", {})}.items()
-    )
-    return TradeoffResult(
-        name=f"{preset} {rho:g}",
-        preset=preset,
-        rho=rho,
-        count=50,
-        bytes=4200,
-        seconds=seconds,
-        peak_memory_bytes=300_000_000,
-        psnr=psnr,
-        ssim=psnr / 100,
-        report=SimplifyReport(
-            input_count=500,
-            output_count=50,
-            target_count=50,
-            rho=rho,
-            stages=stages,
-            config=cvtgs.SimplifyConfig(),
-        ),
-        **more,
-    )
+from tradeoff_cases import result
 
 
 def scores(name: str) -> SceneScores:
