@@ -9,7 +9,13 @@ from cvtgs.edit import Motion, move
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import psnr
 from cvtgs.filters import FLYAWAY_RADII, filter_rows, flyaway_rows, visible_rows
-from cvtgs.validity import invalid_rows, standardized, with_finite_opacities
+from cvtgs.validity import (
+    invalid_rows,
+    lost_step,
+    standardized,
+    with_finite_opacities,
+    writable_rows,
+)
 from cvtgs.views import automatic_views
 from scenes import random_scene, same_bits
 
@@ -256,3 +262,54 @@ def test_wrong_arguments(call, text):
 def test_flyaways_may_hold_exactly_the_share():
     distances, masses = torch.tensor([1.0, 200.0]), torch.tensor([3.0, 1.0])
     assert flyaway_rows(distances, masses, max_share=0.25).tolist() == [False, True]
+
+
+def test_of_equally_faint_ones_the_lightest_are_dropped_first() -> None:
+    opacities, masses = torch.tensor([0.05, 0.05, 0.9]), torch.tensor([2.0, 1.0, 97.0])
+    keep = visible_rows(opacities, masses, min_opacity=0.1, max_mass_share=0.01, at_least=1)
+    assert keep.tolist() == [True, False, True]
+
+
+def test_the_filter_keeps_opacities_at_the_threshold() -> None:
+    scene = random_scene(50)
+    least = float(scene.opacities.sort().values[20])
+    config = cvtgs.SimplifyConfig.from_mapping(
+        {"filter": {"min_opacity": least}, "effects": {"haze": "off"}}
+    )
+    found = filter_rows(scene, analyze(scene, config), 1, config.filter)
+    assert (len(found.rows), found.left_out) == (30, 20)
+
+
+def test_without_haze_faint_gaussians_stay_only_up_to_the_target() -> None:
+    scene = random_scene(50)
+    config = cvtgs.SimplifyConfig.from_mapping(
+        {"filter": {"min_opacity": 0.9, "max_mass_share": 0.1}, "effects": {"haze": "off"}}
+    )
+    visible = int((scene.opacities >= 0.9).sum())
+    found = filter_rows(scene, analyze(scene, config), visible + 2, config.filter)
+    assert len(found.rows) == visible + 2
+
+
+@pytest.mark.parametrize(
+    ("shift", "size", "step"), [(4.1e6, 0.1, 0.25), (4.1e6, 40.0, 0.0), (INF, 0.1, 0.0)]
+)
+def test_steps_of_far_positions_are_lost_only_beside_small_gaussians(
+    shift: float, size: float, step: float
+) -> None:
+    scene = random_scene(50, size=size)
+    assert lost_step(scene.with_tensors({"means": scene.means + shift}, {})) == step
+
+
+def test_standard_rows_have_finite_scales() -> None:
+    scales = standardized(changed("log_scales", 2, 200.0)).scales
+    assert bool(scales.isfinite().all())
+    assert float(scales[2, 2]) > 3e38
+
+
+def test_positions_beyond_float32_count_as_infinite() -> None:
+    scene = random_scene(3, dtype=torch.float64)
+    means = scene.means.clone()
+    means[0, 0], means[1, 0] = 3e38, 1e39
+    far = scene.with_tensors({"means": means}, {})
+    assert invalid_rows(far)["means"].tolist() == [False, True, False]
+    assert writable_rows(far).tolist() == [True, False, True]

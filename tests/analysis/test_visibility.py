@@ -7,7 +7,14 @@ import torch
 from torch import Tensor
 
 from cvtgs.analysis import ambient_visibility
-from cvtgs.analysis.analyze import add_depths, empty_depth_grid, visibility_at, visibility_grid
+from cvtgs.analysis.analyze import (
+    add_depths,
+    apparent_areas,
+    empty_depth_grid,
+    visibility_at,
+    visibility_grid,
+)
+from cvtgs.config import TessellationConfig
 from cvtgs.math.frames import RobustFrame
 
 ORIGIN = torch.zeros(3, dtype=torch.float64)
@@ -117,3 +124,15 @@ def test_parts_of_a_scene_add_up_to_the_same_grid():
     assert torch.equal(found, ambient_visibility(means, masses, UNIT))
     assert found.amin() < 0.9
     assert float(visibility_grid(empty_depth_grid(means.device)).amin()) == 1.0
+
+
+def test_enclosed_and_far_gaussians_count_less() -> None:
+    """By the share of an enclosed one, and by the square of the distance in robust radii."""
+    areas, distances, seen = torch.tensor(
+        [[8.0, 8.0, 8.0, 8.0], [0.5, 1.0, 1.0, 2.0], [1.0, 0.0, 0.5, 0.0]], dtype=torch.float64
+    )
+    config = TessellationConfig(hidden_share=0.25)
+    found = apparent_areas(areas, distances, seen, config=config)
+    assert found.tolist() == [8.0, 2.0, 5.0, 0.5]
+    config = TessellationConfig(hidden_share=1.0, perspective=False)
+    assert apparent_areas(areas, distances, seen[:0], config=config).tolist() == [8.0] * 4

@@ -10,8 +10,8 @@ from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.boxes import Box, inside
 from cvtgs.cli.main import main
 from cvtgs.io.ply import open_rows
-from cvtgs.outofcore import simplify_file
-from cvtgs.outofcore.scan import read_sample
+from cvtgs.outofcore import scan, simplify_file
+from cvtgs.outofcore.scan import RangeTotals, read_sample
 from scenes import random_scene, same_bits
 
 BOX = Box(min=(-1e9, -1e9, 0.6), max=(1e9, 1e9, 1e9))
@@ -100,12 +100,14 @@ def test_the_report_matches_a_run_in_one_piece(tmp_path):
     broken = scene.with_tensors({"means": means, "quats": quats, "logit_opacities": logits}, {})
     simplifier = Simplifier("paper", device="cpu")
     with pytest.warns(UserWarning, match=r"dropped 3 of 900 .*\(means 2, quats 2\)"):
-        _, report = in_blocks(tmp_path, broken, simplifier=simplifier, range_rows=250)
+        path, report = in_blocks(tmp_path, broken, simplifier=simplifier, range_rows=250)
     with pytest.warns(UserWarning, match=r"dropped 3 of 900 .*\(means 2, quats 2\)"):
         whole = simplifier.run(broken, 0.3).report
     assert report.invalid_rows == whole.invalid_rows == {"means": 2, "quats": 2}
     assert report.filtered_count == whole.filtered_count > 90
     assert report.filtered_mass_share == pytest.approx(whole.filtered_mass_share)
+    assert report.mass_out == pytest.approx(float(cvtgs.load(path).masses.sum()))
+    assert report.largest_cell > 1.5 * (900 - 3 - report.filtered_count) / report.output_count
     assert len(report.energies) == len(whole.energies)
     assert report.energies == pytest.approx(whole.energies, rel=0.2)
     assert sorted(report.energies, reverse=True) == list(report.energies)
@@ -141,3 +143,18 @@ def test_a_sample_of_rows_in_a_periodic_order_is_balanced(tmp_path, period):
         assert len(sample) == -(-len(scene) // step)
         shares = torch.bincount(sample.means[:, 0].long()) / len(sample)
         assert float(shares.amin()) > 0.85 / period
+
+
+@pytest.mark.parametrize(("count", "most"), [(10, 2**-20), (11, -1.0)])
+def test_a_hundredth_of_all_gaussians_are_no_flyaways(count: int, most: float) -> None:
+    """As in a run in one piece: they stand around a small detailed object."""
+    totals = RangeTotals(
+        depths=torch.zeros(0, dtype=torch.int64),
+        masses=(1.0,),
+        falloff_masses=(1.0,),
+        far_masses=torch.full((count,), 2**-20).double(),
+        invalid_rows={},
+        valid_count=1000,
+        kept_count=0,
+    )
+    assert vars(scan)["_max_flyaway_mass"](totals, 0.001) == most

@@ -87,3 +87,18 @@ def test_errors_are_shared_out_as_by_torch(monkeypatch, mode):
     wanted = error_shares(scene[:9], views, backend="torch")
     torch.testing.assert_close(found.clone(), wanted, rtol=1e-3, atol=1e-2)
     assert len(none) == 0
+
+
+def test_images_of_interleaved_sizes_are_in_the_order_of_the_cameras() -> None:
+    cameras = replace(around(4), strides=(1, 2, 2, 1))
+    found, wanted = images(random_scene(20, seed=5), cameras)
+    assert float((wanted[1] - wanted[2]).abs().amax()) > 0.1
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-3)
+
+
+def test_observed_images_have_depths() -> None:
+    scene, camera = random_scene(20, degree=0, seed=5), around(1)
+    ((found, _),) = gsplat_backend.observe(scene, camera, sh_degree=0)
+    wanted = torch_backend.rasterize(scene, camera, sh_degree=0)
+    assert float(wanted.depth.amax()) > 1.0
+    torch.testing.assert_close(found.depth, wanted.depth, rtol=1e-3, atol=1e-2)

@@ -1,8 +1,10 @@
 """Protected regions: kept bit for bit, counted, and an error if they do not fit the target."""
 
+import codecs
 import json
 import pickle
 import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -148,6 +150,12 @@ def test_boxes_and_centres_are_checked(boxes, points, text):
         inside(boxes, points)
 
 
+def test_a_point_may_be_in_any_of_several_boxes_which_may_be_flat() -> None:
+    flat, second = Box(min=(0, 0, 0), max=(1, 1, 0)), Box(min=(2, 2, 2), max=(3, 3, 3))
+    points = torch.tensor([[0.5, 0.5, 0.0], [2.5, 2.5, 2.5], [0.5, 0.5, 2.5]])
+    assert inside([flat, second], points).tolist() == [True, True, False]
+
+
 @pytest.mark.parametrize("corners", [{"min": (1, 0, 0), "max": (0, 0, 0)}, {"min": (0, 0)}, {}])
 def test_bad_boxes_are_refused(corners):
     with pytest.raises(InvalidArgumentError, match="a box must have a min and a max of three"):
@@ -161,6 +169,7 @@ def test_bad_boxes_are_refused(corners):
     [
         ("nothing", "must be valid JSON"),
         ("[]", "at least one box"),
+        (100_000 * "[", "must be valid JSON"),
         ('{"min": [0, 0, 0]}', "max: field required"),
         ('{"min": [0, 0, 2], "max": [1, 1, 1]}', "min must not be above max"),
         ('{"min": [0, 0], "max": [1, 1, 1]}', "min.2"),
@@ -174,6 +183,12 @@ def test_bad_box_files_say_what_is_wrong(tmp_path, text, problem):
         read_boxes(path)
     with pytest.raises(InputNotFoundError):
         read_boxes(tmp_path / "none.json")
+
+
+def test_box_files_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    path = tmp_path / "box.json"
+    path.write_bytes(codecs.BOM_UTF8 + b'{"min": [0, 0, 0], "max": [1, 2, 3]}')
+    assert read_boxes(path) == (Box(min=(0, 0, 0), max=(1, 2, 3)),)
 
 
 def test_the_command_keeps_the_gaussians_in_boxes(scene, tmp_path):

@@ -158,10 +158,22 @@ def test_a_stream_without_its_plan_starts_over(tmp_path: Path, source: Path, nam
 
 
 @pytest.mark.slow
-def test_other_options_start_the_stream_over(tmp_path: Path, source: Path) -> None:
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"chunk_gaussians": 200},
+        {"sh_degree": 0},
+        {"axes": ("rdf", "rub")},
+        {"rhos": [1.0, 0.1, 0.05]},
+    ],
+)
+def test_other_options_start_the_stream_over(tmp_path: Path, options: dict[str, Any]) -> None:
+    save(make("courtyard", 300, sh_degree=0, seed=3), tmp_path / "scene.ply")
+    usual = {"rhos": [1.0, 0.1], "kind": "sog", "blocks": 3, "simplifier": FAST}
     with pytest.raises(StoppedError):
-        stream(source, tmp_path / "out", workers=until(2, []))
-    assert stream(source, tmp_path / "out", chunk_gaussians=200).resumed_blocks == 0
+        stream_file(tmp_path / "scene.ply", tmp_path / "out", **usual, workers=until(2, []))
+    other = usual | options
+    assert stream_file(tmp_path / "scene.ply", tmp_path / "out", **other).resumed_blocks == 0
 
 
 @pytest.mark.slow
@@ -196,6 +208,15 @@ def test_axes_and_sh_degree_are_applied(tmp_path: Path) -> None:
     assert [scene.sh_degree for scene in (full, plain, turned)] == [1, 0, 0]
     flipped = plain.means * torch.tensor([1.0, -1.0, -1.0])
     assert float(torch.cdist(flipped, turned.means).amin(dim=1).max()) < 0.05
+
+
+def test_3d_tiles_may_have_an_input_of_other_axes(tmp_path: Path) -> None:
+    save(make("courtyard", 300, sh_degree=0, seed=3), tmp_path / "scene.ply")
+    options: dict[str, Any] = {"kind": "3dtiles", "blocks": 2, "simplifier": FAST}
+    report = stream_file(
+        tmp_path / "scene.ply", tmp_path / "out", [1.0], axes=("rub", "rdf"), **options
+    )
+    assert [level.gaussians for level in report.levels] == [300]
 
 
 def test_an_unknown_kind_is_refused_before_the_work(tmp_path: Path, source: Path) -> None:

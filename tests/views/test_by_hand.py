@@ -192,3 +192,84 @@ def test_what_is_much_nearer_than_the_subject_is_an_obstacle(subject, least, mos
     good, penalties = scoring.score_cameras(place, cameras, distances=distances)
     assert bool(good) is (most == 0)
     assert least <= float(penalties) <= most
+
+
+def positions_of(place: SceneLayout) -> CameraPositions:
+    distances = torch.tensor([0.5, 1.0, 2.0, 4.0]).double()
+    return CameraPositions(
+        layout=place,
+        least_growth=0.0,
+        sharp_sides=torch.zeros(32).bool(),
+        cluttered=torch.zeros(0, 3).double(),
+        eyes=distances[:, None] * UP + torch.tensor([0.1, 0.0, 0.0]).double(),
+        distances=distances,
+    )
+
+
+@pytest.mark.parametrize(
+    ("bounded", "room", "field"), [(True, None, 50.0), (False, None, 60.0), (False, CENTER, 65.0)]
+)
+def test_random_views_of_rooms_and_open_places_have_wider_fields(
+    monkeypatch: pytest.MonkeyPatch, bounded: bool, room: torch.Tensor | None, field: float
+) -> None:
+    monkeypatch.setattr(CameraPositions, "admit", lambda _, eyes: torch.ones(len(eyes)).bool())
+    place = positions_of(layout_of(bounded=bounded, room=room))
+    found = mixed.random_views(place, 3, size=48, seed=0)
+    focal = 24 / math.tan(math.radians(field / 2))
+    assert found.Ks[:, 0, 0].tolist() == found.Ks[:, 1, 1].tolist() == pytest.approx([focal] * 3)
+
+
+def test_random_views_aim_near_the_middle_or_in_a_room_at_surfaces_not_too_near() -> None:
+    aims, eyes = vars(mixed)["_targets"], torch.zeros(200, 3).double()
+    found = aims(positions_of(layout_of(room=None)), eyes, 0)
+    away = torch.linalg.vector_norm(found, dim=1)
+    assert 0.1 < float(away.amax()) <= 0.25
+    points = torch.tensor([0.1, 0.29, 0.31, 0.5]).double()[:, None] * UP
+    voxels = Voxels(points=points, normals=points, log_sizes=points[:, 2])
+    found = aims(positions_of(layout_of(room=CENTER, voxels=voxels)), eyes, 0)
+    assert set((found[:, 2] * 100).round().tolist()) == {31.0, 50.0}
+
+
+@pytest.mark.parametrize("is_good", [True, False])
+def test_random_positions_are_moved_by_a_twentieth_of_a_radius_if_still_good(
+    monkeypatch: pytest.MonkeyPatch, is_good: bool
+) -> None:
+    good = torch.full((400,), is_good)
+    monkeypatch.setattr(CameraPositions, "admit", lambda *_: good)
+    frame = RobustFrame(center=torch.zeros(3).double(), radius=2.0)
+    place = positions_of(layout_of(frame=frame))
+    found = place.near(400, (0.9, 1.1), seed=0) - place.eyes[1]
+    most = found.abs().amax(dim=0)
+    assert bool(((most > 0.09) & (most <= 0.1)).all() if is_good else (most == 0).all())
+
+
+def test_a_quarter_of_mixed_views_is_automatic_a_quarter_near_and_half_around(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[tuple[str, int]] = []
+
+    def views(count: int) -> Cameras:
+        return cameras_on_a_line([float(number) for number in range(count)])
+
+    def found(_: object, count: int, **options: object) -> Cameras:
+        asked.append(("automatic", count))
+        return views(count)
+
+    def drawn(_: object, count: int, *, reach: object = None, **options: object) -> Cameras:
+        asked.append(("near" if reach == (0.2, 1.4) else "around", count))
+        return views(count)
+
+    monkeypatch.setattr(mixed, "automatic_views", found)
+    monkeypatch.setattr(mixed, "random_views", drawn)
+    assert len(mixed.mixed_views(positions_of(layout_of()), 13, size=8, sharp=False)) == 13
+    assert asked == [("automatic", 3), ("near", 3), ("around", 7)]
+
+
+@pytest.mark.parametrize("size", [(64, 32), (32, 64)])
+def test_the_field_of_view_is_that_of_the_shorter_side(size: tuple[int, int]) -> None:
+    eyes = torch.tensor([[2.0, 0.0, 0.0]]).double()
+    found = scoring.cameras_at(eyes, -eyes, UP, size=size, field=90.0)
+    width, height = size
+    assert found.Ks[0].tolist() == [
+        pytest.approx([16.0, 0.0, width / 2]), pytest.approx([0.0, 16.0, height / 2]), [0, 0, 1],
+    ]  # fmt: skip

@@ -137,3 +137,41 @@ def test_a_test_split_of_all_cameras_is_none(tmp_path, scene):
         path.write_text(json.dumps({**document, "test_filenames": names[:count]}))
         own = find_own_cameras(scene, tmp_path / "scene.ply")
         assert (own.test_cameras() is not None) == is_found
+
+
+def test_a_single_stray_gaussian_in_the_images_does_not_count(
+    tmp_path: Path, scene: cvtgs.GaussianScene
+) -> None:
+    file = model_of(tmp_path, scene)
+    cameras = automatic_views(scene, 5, width=64, height=48)
+    means = scene.means + torch.tensor([0.0, 500.0, 0.0])
+    means[:3] = scene.means[:3]
+    opaque = torch.full_like(scene.logit_opacities, 3.0)
+    write_inria(tmp_path / "cameras.json", cameras)
+    away = scene.with_tensors({"means": means, "logit_opacities": opaque}, {})
+    assert find_own_cameras(away, file) is None
+
+
+@pytest.mark.parametrize(("side", "is_found"), [((2.0, 0.0), True), ((0.0, 2.0), False)])
+def test_cameras_do_not_look_at_what_is_above_their_images(
+    tmp_path: Path, scene: cvtgs.GaussianScene, side: tuple[float, float], is_found: bool
+) -> None:
+    file = model_of(tmp_path, scene)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[2, 3] = 5.0
+    Ks = viewmat.new_tensor([[50.0, 0, 50.0], [0, 50.0, 10.0], [0, 0, 1.0]])  # noqa: N806
+    wide = cvtgs.Cameras(
+        viewmats=viewmat.expand(2, 4, 4), Ks=Ks.expand(2, 3, 3), width=100, height=20
+    )
+    write_inria(tmp_path / "cameras.json", wide)
+    moved = scene.with_tensors({"means": 0.01 * scene.means + torch.tensor([*side, 0.0])}, {})
+    assert (find_own_cameras(moved, file) is not None) == is_found
+
+
+def test_damaged_cameras_cause_one_warning(tmp_path: Path, scene: cvtgs.GaussianScene) -> None:
+    """Though they are found in the folder, too."""
+    file = model_of(tmp_path, scene)
+    (tmp_path / "cameras.json").write_text("[{")
+    with pytest.warns(UserWarning, match="cameras are not used") as caught:
+        assert find_own_cameras(scene, file) is None
+    assert len(caught) == 1
