@@ -258,3 +258,19 @@ def test_observed_views_are_images_and_contributions(backend, degree):
     assert torch.equal(views.alpha, images.alpha)
     assert torch.equal(views.contributions, contributions(scene, cameras, backend=backend))
     assert not views.rgb.requires_grad
+
+
+@backends
+def test_colours_and_images_of_other_sizes_are_refused(backend):
+    scene = random_scene(50)
+    weights = blending_weights(scene, around(1), backend=backend)
+    image = weights.paint(torch.ones(50, 3))
+    height, width = image.shape[:2]
+    for colors in (torch.ones(50, 1), torch.ones(49, 3), torch.ones(51, 3), torch.ones(3)):
+        for product in (weights.paint, weights.normal):
+            with pytest.raises(InvalidArgumentError, match=r"^colors must .* of shape \(50, 3\)"):
+                product(colors)
+    for wrong in (image[:, 1:], image[1:], image[..., :1], image.reshape(-1, 3)):
+        shape = rf"of shape \({height}, {width}, 3\)"
+        with pytest.raises(InvalidArgumentError, match=f"^image must .* {shape}"):
+            weights.collect(wrong)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 import cvtgs
 from cvtgs.cameras import Cameras, look_at
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import parameters
 from cvtgs.math.frames import RobustFrame
 from cvtgs.refinement.images import generated_views
@@ -376,3 +377,16 @@ def test_cameras_in_a_room_stand_back_by_a_share_of_the_way_to_the_wall_behind(r
         back = 0.65 * wall * radius
         assert cameras.centers[row].tolist() == pytest.approx([-back * side, 0, 0], abs=1e-6)
         assert float(distances[row]) == pytest.approx(back + 0.5 * radius)
+
+
+def test_positions_of_any_float_dtype_are_judged_and_others_refused():
+    positions = find_view_positions(cvtgs.synthetic.scene("object", 300, sh_degree=0, seed=2))
+    eyes = torch.tensor([[0.0, -1.0, 9.0], [0.0, 0.0, 0.0]])
+    assert torch.equal(positions.admit(eyes), positions.admit(eyes.double()))
+    for wrong in (eyes[0], eyes[:, :2], eyes.long(), eyes.tolist()):
+        with pytest.raises(InvalidArgumentError, match=r"^eyes must be a tensor of floats of"):
+            positions.admit(wrong)
+    for count, seed in ((-1, 0), (1.5, 0), (2, 0.5)):
+        with pytest.raises(InvalidArgumentError, match="must be a whole number"):
+            positions.near(count, (1, 2), seed)
+    assert positions.near(2, (1, 2), 2**70).shape == (2, 3)

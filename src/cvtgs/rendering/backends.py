@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
+from cvtgs.checks import check_kinds
 from cvtgs.errors import DeviceError, InvalidArgumentError, MissingDependencyError
 from cvtgs.math import segments
 from cvtgs.progress import ProgressEvent, ProgressListener
@@ -144,6 +145,16 @@ def collect_images(
     return RasterOutput(rgb=layers[..., :3], depth=layers[..., 3], alpha=1 - layers[..., 4])
 
 
+def check_colors(colors: Tensor, count: int) -> None:
+    """Raise unless there is a colour for each Gaussian; kernels would read beyond the array."""
+    check_kinds({"colors": Float[Tensor, f"{count} 3"]}, {"colors": colors})
+
+
+def check_image(image: Tensor, size: tuple[int, int]) -> None:
+    """Raise unless an image has a width and height."""
+    check_kinds({"image": Float[Tensor, f"{size[1]} {size[0]} 3"]}, {"image": image})
+
+
 def without_gradients(scene: GaussianScene) -> GaussianScene:
     """Return a scene of constants that autograd takes, also in inference mode."""
     with torch.inference_mode(mode=False):
@@ -181,7 +192,7 @@ class PixelWeights:
         size: tuple[int, int],
         count: int,
     ) -> None:
-        self._size = size
+        self._size, self._count = size, count
         by_pixel, self._pixel_starts = segments.sort_by_label(pixels, size[0] * size[1])
         self._row_of, self._weight_of = rows[by_pixel], weights[by_pixel]
         by_row, self._row_starts = segments.sort_by_label(rows, count)
@@ -189,11 +200,13 @@ class PixelWeights:
 
     def paint(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
         """Return the image for these colours of the Gaussians."""
+        check_colors(colors, self._count)
         image = segments.segment_sum_of(colors, self._row_of, self._pixel_starts, self._weight_of)
         return image.reshape(self._size[1], self._size[0], 3)
 
     def collect(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Return, for every Gaussian, the sum of the pixels times its weights."""
+        check_image(image, self._size)
         flat = image.reshape(-1, 3)
         return segments.segment_sum_of(flat, self._pixels, self._row_starts, self._weights)
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.math.parameters import MIN_ALPHA
+from cvtgs.rendering.backends import check_colors, check_image
 from cvtgs.rendering.compiled import (
     Array,
     Ints,
@@ -270,6 +271,7 @@ class TileWeights:
 
     def collect(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Return, for every Gaussian, the sum of the pixels times its weights."""
+        check_image(image, self._size)
         sums = np.empty((len(self._tiles.lists), 3), np.float32)
         pixels = image.detach().contiguous().numpy().astype(np.float32, copy=False)
         collect_all(self._tiles, self._weights, pixels, sums)
@@ -288,6 +290,7 @@ class TileWeights:
         return self._of_gaussians(sums)
 
     def _of_splats(self, colors: Tensor) -> NDArray[np.float32]:
+        check_colors(colors, self._count)
         return colors.detach().numpy()[self._rows].astype(np.float32, copy=False)
 
     def _of_gaussians(self, sums: NDArray[np.float32]) -> Tensor:

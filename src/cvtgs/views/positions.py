@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.counts import is_truth_value, real_number
+from cvtgs.checks import check_kinds
+from cvtgs.counts import checked_whole, is_truth_value, real_number
 from cvtgs.devices import HOST, in_chunks
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
@@ -98,8 +99,16 @@ class CameraPositions:
         object. No position with clutter before the scene may be nearer than one without.
 
         Args:
-            eyes: Positions, scene units.
+            eyes: ``(c, 3)`` positions, scene units.
+
+        Returns:
+            ``(c,)`` mask.
+
+        Raises:
+            InvalidArgumentError: ``eyes`` is no tensor of floats of this shape.
         """
+        check_kinds({"eyes": Float[Tensor, "c 3"]}, {"eyes": eyes})
+        eyes = eyes.to(self.eyes)
         free = stand_free(self.layout, eyes)
         unsure = free & ~_sees_sharp_sides(self.layout, eyes, self.sharp_sides)
         free[unsure] = _growths(self.layout, eyes[unsure]) >= self.least_growth
@@ -122,14 +131,16 @@ class CameraPositions:
             Good positions, moved by up to a twentieth of a radius along each axis if still good.
 
         Raises:
-            InvalidArgumentError: ``reach`` does not consist of two ascending numbers from 0.
+            InvalidArgumentError: ``reach`` does not consist of two ascending numbers from 0, or
+                count or seed are no whole numbers.
         """
         ends = tuple(map(real_number, reach)) if isinstance(reach, Sequence) else ()
         if len(ends) != 2 or not 0 <= ends[0] <= ends[1]:
             raise InvalidArgumentError(
                 f"reach must be two ascending numbers of at least 0, found {shown(reach)}."
             )
-        generator = torch.Generator().manual_seed(seed)
+        count = checked_whole(count, "count", least=0)
+        generator = torch.Generator().manual_seed(checked_seed(seed))
         low, high = ends
         beyond = (low - self.distances).clamp_min(self.distances - high).clamp_min(0)
         within = (beyond <= beyond.amin()).nonzero()[:, 0]
