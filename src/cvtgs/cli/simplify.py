@@ -8,12 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cvtgs
-from cvtgs.cli.blocks import (
-    add_block_options,
-    block_workers,
-    check_block_device,
-    memory_of,
-)
+from cvtgs.cli.blocks import add_block_options, block_workers, check_block_device, memory_of
 from cvtgs.cli.cameras import check_split, read_cameras
 from cvtgs.cli.display import TIE, progress_bars, report_notes, target_note
 from cvtgs.cli.goals import STARTED, check_goals, choose_preset, has_target, search_target

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.checks import check_kinds
+from cvtgs.checks import checked
 from cvtgs.counts import checked_whole, is_truth_value, real_number
 from cvtgs.devices import HOST, in_chunks
 from cvtgs.errors import InvalidArgumentError
@@ -89,6 +89,7 @@ class CameraPositions:
     eyes: Float[Tensor, "p 3"]
     distances: Float[Tensor, "p"]
 
+    @checked
     def admit(self, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, "c"]:
         """Return a mask of the good positions.
 
@@ -107,7 +108,6 @@ class CameraPositions:
         Raises:
             InvalidArgumentError: ``eyes`` is no tensor of floats of this shape.
         """
-        check_kinds({"eyes": Float[Tensor, "c 3"]}, {"eyes": eyes})
         eyes = eyes.to(self.eyes)
         free = stand_free(self.layout, eyes)
         unsure = free & ~_sees_sharp_sides(self.layout, eyes, self.sharp_sides)
