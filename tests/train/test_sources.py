@@ -1,5 +1,6 @@
 """Sources: scenes for training, scenes for validation, and variants made of them."""
 
+import hashlib
 import math
 import random
 from dataclasses import replace
@@ -52,8 +53,34 @@ def test_only_scenes_for_validation_have_cameras(tmp_path):
     write_scenes(tmp_path, ["a", "exam"], 50)
     for name in ("a", "exam"):
         (tmp_path / f"{name}.transforms.json").write_text("{}", encoding="utf-8")
-    cameras = {source.name: source.cameras for source in find_sources(tiny_data(tmp_path), seed=0)}
+    sources = find_sources(tiny_data(tmp_path), seed=0)
+    cameras = {source.name: source.cameras for source in sources}
     assert cameras == {"a": None, "exam": tmp_path / "exam.transforms.json"}
+    hashes = {source.name: source.origin.cameras_sha256 for source in sources}
+    assert hashes == {"a": "", "exam": hashlib.sha256(b"{}").hexdigest()}
+
+
+def test_scenes_may_be_named_with_their_suffix(tmp_path):
+    write_scenes(tmp_path, ["a", "exam"], 50)
+    sources = find_sources(tiny_data(tmp_path, validation=("exam.ply",)), seed=0)
+    assert names_of(sources, is_validation=True) == ["exam"]
+
+
+def test_scenes_of_the_same_name_are_one_clear_error(tmp_path):
+    """So are a file that is named like a copy, and a folder that is given twice."""
+    first = write_scenes(tmp_path / "one", ["a", "a-copy0", "exam"], 50)
+    second = write_scenes(tmp_path / "two", ["a"], 50)
+    for folders, copies, named, times in (
+        ((first, second), 0, [first / "a.ply", second / "a.ply"], 2),
+        ((first,), 1, [first / "a-copy0.ply"], 2),
+        ((second, first, second), 0, [second / "a.ply", first / "a.ply", second / "a.ply"], 3),
+    ):
+        with pytest.raises(ConfigError) as caught:
+            find_sources(tiny_data(first, folders=folders, copies=copies), seed=0)
+        assert str(caught.value) == (
+            f"data.folders: {times} scenes would be named {named[0].stem}, of "
+            f"{', '.join(map(str, named))}; use a file once, and rename others."
+        )
 
 
 def test_hidden_files_are_no_scenes(tmp_path):

@@ -198,8 +198,13 @@ SCENES = (LearnedScene(name="room", count=5, sha256="ab"), LearnedScene(name="ex
 
 @pytest.mark.parametrize(
     "scenes",
-    [SCENES[:1], (*SCENES[:1], SCENES[1].model_copy(update={"count": 8})), SCENES[::-1]],
-    ids=["fewer", "other", "other order"],
+    [
+        SCENES[:1],
+        (*SCENES[:1], SCENES[1].model_copy(update={"count": 8})),
+        SCENES[::-1],
+        (*SCENES[:1], SCENES[1].model_copy(update={"cameras_sha256": "cd"})),
+    ],
+    ids=["fewer", "other", "other order", "other cameras"],
 )
 def test_other_scenes_are_one_clear_error(tmp_path, scenes):
     """Otherwise the checkpoint would name scenes that only the last steps saw."""
@@ -209,8 +214,8 @@ def test_other_scenes_are_one_clear_error(tmp_path, scenes):
     with pytest.raises(CheckpointError) as caught:
         TrainState(small_net(), CONFIG, scenes).load(path, CONFIG)
     assert str(caught.value) == (
-        f"{path}: the state belongs to a training run on other scenes or in another order "
-        f"(exam differs); restore the scenes, or train to another output."
+        f"{path}: the state belongs to a training run on other scenes, in another order or "
+        f"with other cameras (exam differs); restore these, or train to another output."
     )
 
 

@@ -9,7 +9,7 @@ import cvtgs
 from cvtgs.cli.display import progress_bars, say
 from cvtgs.cli.options import AddParser, add_options
 from cvtgs.cli.paths import any_path
-from cvtgs.errors import OutputError, how_to_install, warn
+from cvtgs.errors import how_to_install, warn
 
 if TYPE_CHECKING:
     from cvtgs.train import History, TrainConfig
@@ -73,8 +73,6 @@ def train(options: argparse.Namespace) -> None:
 
     config = cvtgs.train.TrainConfig.from_toml(options.config)
     config = _with_scenes(config, options.scenes, options.validation)
-    if options.output.suffix != ".safetensors":
-        raise OutputError(f"{options.output}: the name must end in .safetensors.")
     files = cvtgs.train.TrainFiles.beside(options.output, options.cache)
     resumes = options.resume and files.state.is_file()
     if options.resume and not resumes:

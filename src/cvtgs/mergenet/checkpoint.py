@@ -43,12 +43,14 @@ class LearnedScene(Record):
         sha256: Hash of the file, hexadecimal; empty for a generated scene, which is determined by
             name, count and version of cvtgs.
         is_validation: Whether it was used for validation only.
+        cameras_sha256: Hash of the file of its cameras, hexadecimal; empty if views were found.
     """
 
     name: str
     count: int
     sha256: str = ""
     is_validation: bool = False
+    cameras_sha256: str = ""
 
 
 KINDS = {"gated": Architecture, "published": PublishedArchitecture}

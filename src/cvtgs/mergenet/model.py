@@ -4,7 +4,7 @@ import copy
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 import pydantic
 import torch
@@ -22,6 +22,9 @@ from cvtgs.cells.descriptors import (
 from cvtgs.config.base import Record
 from cvtgs.devices import move_together
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
+
+Width = Annotated[int, pydantic.Field(ge=1, le=1024)]
+CellWidth = Annotated[int, pydantic.Field(ge=1, le=4096)]
 
 LARGE_GROWTH = 0.6  # unit of changes of log scales in the cost of residuals
 LARGEST_LOGIT_CHANGE = 2.0  # largest change of an opacity logit
@@ -65,8 +68,8 @@ class Architecture(Record):
     member_features: int = MEMBER_FEATURES
     pair_features: int = PAIR_FEATURES
     cell_features: int = CELL_FEATURES
-    width: int = pydantic.Field(default=32, ge=1, le=1024)
-    cell_width: int = pydantic.Field(default=64, ge=1, le=4096)
+    width: Width = 32
+    cell_width: CellWidth = 64
     largest_growth: float = pydantic.Field(default=0.6, gt=0.0, le=3.0)
 
 

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Literal
 
-import pydantic
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -12,7 +11,7 @@ from cvtgs.cells import Partition
 from cvtgs.config.base import Record
 from cvtgs.math import parameters
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
-from cvtgs.mergenet.model import CellNetwork, MergeNet, two_layers
+from cvtgs.mergenet.model import CellNetwork, CellWidth, MergeNet, Width, two_layers
 from cvtgs.scene import GaussianScene
 
 SH_COEFFICIENTS = 16
@@ -42,8 +41,8 @@ class PublishedArchitecture(Record):
 
     kind: Literal["published"] = "published"
     member_features: int = PUBLISHED_FEATURES
-    width: int = pydantic.Field(default=64, ge=1, le=1024)
-    cell_width: int = pydantic.Field(default=128, ge=1, le=4096)
+    width: Width = 64
+    cell_width: CellWidth = 128
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

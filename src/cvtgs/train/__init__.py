@@ -1,9 +1,9 @@
 """Training of MergeNet: scenes, cases, losses, and a resumable loop."""
 
 from cvtgs.train.config import DataConfig, LossConfig, TrainConfig, ViewsConfig
-from cvtgs.train.loop import TrainFiles, train
+from cvtgs.train.loop import train
 from cvtgs.train.scenes import Source
-from cvtgs.train.state import Gain, History, Validation
+from cvtgs.train.state import Gain, History, TrainFiles, Validation
 
 __all__ = [
     "DataConfig",

@@ -8,6 +8,7 @@ import pydantic
 from cvtgs.config import Section, explain, read_toml
 from cvtgs.errors import ConfigError
 from cvtgs.mergenet import SHIPPED
+from cvtgs.mergenet.model import CellWidth, Width
 
 Ratio = Annotated[float, pydantic.Field(gt=0.0, lt=1.0)]
 Count = Annotated[int, pydantic.Field(ge=1)]
@@ -21,8 +22,8 @@ class DataConfig(Section):
     Attributes:
         folders: Folders of PLY files, of which hidden ones do not count; relative paths start at
             the folder of the configuration file.
-        validation: Names of files (without .ply) for validation only; if none is named, every
-            fifth file, starting with the second. They are rendered with the cameras of
+        validation: Names of files, with or without ``.ply``, for validation only; if none is named,
+            every fifth file, starting with the second. They are rendered with the cameras of
             ``NAME.transforms.json`` if it is in the same folder.
         generated: Number of generated training scenes of each kind.
         generated_validation: Number of generated validation scenes of each kind.
@@ -109,8 +110,8 @@ class TrainConfig(Section):
             last step; 0 for one fall only. With its number of steps here, and more steps, a
             finished training can be resumed.
         restart_rate: Largest learning rate after the restart.
-        width: Units of the layers for members and neighbours.
-        cell_width: Units of the layers for cells.
+        width: Units of the layers for members and neighbours, at most 1024.
+        cell_width: Units of the layers for cells, at most 4096.
         largest_growth: Largest change of a log scale; the published network has no limit.
         validate_every: Steps between validations.
         patience: Number of validations without a new best after which training stops.
@@ -139,8 +140,8 @@ class TrainConfig(Section):
     learning_rate: float = pydantic.Field(default=5e-3, gt=0.0)
     restart_step: int = pydantic.Field(default=0, ge=0)
     restart_rate: float = pydantic.Field(default=1e-3, gt=0.0)
-    width: Count = 48
-    cell_width: Count = 96
+    width: Width = 48
+    cell_width: CellWidth = 96
     largest_growth: float = pydantic.Field(default=0.6, gt=0.0, le=3.0)
     validate_every: Count = 500
     patience: Count = 1000

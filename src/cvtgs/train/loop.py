@@ -5,7 +5,6 @@ import math
 import random
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +13,9 @@ import torch
 from torch import Tensor
 
 import cvtgs
-from cvtgs.devices import thread_count
+from cvtgs.checks import checked
+from cvtgs.clock import check_listener
+from cvtgs.devices import chosen_device, on_host, thread_count, without_autocast
 from cvtgs.errors import (
     CheckpointError,
     ConfigError,
@@ -41,7 +42,7 @@ from cvtgs.train.cases import Case, DeviceCopies
 from cvtgs.train.config import TrainConfig
 from cvtgs.train.losses import local_loss, published_loss, scene_loss, validation_psnr
 from cvtgs.train.scenes import Source, TrainingScene, find_sources, prepare_scene
-from cvtgs.train.state import Gain, History, TrainState, Validation
+from cvtgs.train.state import Gain, History, TrainFiles, TrainState, Validation
 
 CaseWithViews = tuple[Case, tuple[ViewImages, ...]]
 
@@ -49,45 +50,11 @@ WARM_UP = 50  # number of steps in which the learning rate rises
 LARGEST_GRADIENT = 1.0  # gradients are clipped to this norm
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrainFiles:
-    """Output files of a training.
-
-    Attributes:
-        checkpoint: The network of the best validation so far, or of the last one.
-        state: State to resume from.
-        curves: Plot of the history; not written without matplotlib.
-        cache: Folder of prepared scenes.
-    """
-
-    checkpoint: Path
-    state: Path
-    curves: Path
-    cache: Path
-
-    @classmethod
-    def beside(cls, checkpoint: Path, cache: Path | None = None) -> "TrainFiles":
-        """Return the default paths for a checkpoint.
-
-        Args:
-            checkpoint: Path of the checkpoint.
-            cache: Folder of prepared scenes; None puts it beside the checkpoint.
-
-        Returns:
-            Paths with the stem of the checkpoint.
-
-        Example:
-            >>> TrainFiles.beside(Path("net.safetensors")).curves.name
-            'net.png'
-        """
-        return cls(
-            checkpoint=checkpoint,
-            state=checkpoint.with_suffix(".state"),
-            curves=checkpoint.with_suffix(".png"),
-            cache=cache or checkpoint.with_suffix(".cache"),
-        )
-
-
+@on_host()
+@torch.inference_mode(mode=False)
+@torch.enable_grad()
+@without_autocast()
+@checked
 def train(
     config: TrainConfig,
     files: TrainFiles,
@@ -110,7 +77,7 @@ def train(
         resume: Whether to resume from ``files.state`` if it exists. All settings but ``note`` and
             ``patience``, the scenes and the start must be the same; their paths may differ. A
             finished training goes on with ``restart_step`` at its end.
-        device: Device to train on.
+        device: Device to train on; ``auto`` takes CUDA if there is any.
         listener: Called for each prepared scene and each step.
         on_validation: Called after each validation.
 
@@ -145,8 +112,9 @@ def train(
         >>> [validation.step for validation in history.validations]
         [0, 2]
     """
+    check_listener(listener)
     sources = find_sources(config.data, seed=config.seed)
-    device = torch.device(device)
+    device = chosen_device(device)
     origins = {source.origin: None for source in sources}
     state = TrainState(_first_net(config).to(device), config, origins)
     if resume and files.state.is_file():

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import random
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache, partial
@@ -63,13 +64,18 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
     """List the scenes of a training without making them: files by name, then generated ones."""
     files = [path for folder in config.folders for path in _files_in(folder)]
     names = [path.stem for path in files]
-    held_out = set(config.validation) or set(names[1::5])
+    held_out = {name.removesuffix(".ply") for name in config.validation} or set(names[1::5])
     missing = sorted(held_out - set(names))
     if missing:
         raise ConfigError(f"data.validation: no file named {missing[0]}.ply in data.folders.")
     sources = [*_from_files(files, held_out, config, seed), *_generated(config, seed)]
-    if len({source.name for source in sources}) < len(sources):
-        raise ConfigError("data.folders: two files have the same name.")
+    name, times = Counter(source.name for source in sources).most_common(1)[0]
+    if times > 1:
+        named = ", ".join(str(path) for path in files if path.stem == name)
+        raise ConfigError(
+            f"data.folders: {times} scenes would be named {name}, of {named}; use a file once, and "
+            f"rename others."
+        )
     for is_validation, text in ((False, "training"), (True, "validation")):
         if not any(source.is_validation == is_validation for source in sources):
             raise ConfigError(f"data: at least one {text} scene is needed, found none.")
@@ -95,16 +101,22 @@ def _from_files(
 ) -> Iterator[Source]:
     for path in files:
         count, name = len(load(path)), path.stem
-        with path.open("rb") as file:
-            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-        is_validation, cameras = name in held_out, path.with_suffix(".transforms.json")
+        sha256, is_validation = _digest(path), name in held_out
+        cameras = path.with_suffix(".transforms.json") if is_validation else None
+        cameras = cameras if cameras is not None and cameras.is_file() else None
         whole = Source(
             name=name,
             identity=sha256,
             is_validation=is_validation,
-            origin=LearnedScene(name=name, count=count, sha256=sha256, is_validation=is_validation),
+            origin=LearnedScene(
+                name=name,
+                count=count,
+                sha256=sha256,
+                is_validation=is_validation,
+                cameras_sha256="" if cameras is None else _digest(cameras),
+            ),
             make=partial(_load_valid, path),
-            cameras=cameras if is_validation and cameras.is_file() else None,
+            cameras=cameras,
         )
         if is_validation:
             yield whole
@@ -126,6 +138,11 @@ def _from_files(
                 f"data.largest_scene, {config.largest_scene:,}, and no blocks are cut from it."
             )
         yield from _copies(originals, config.copies, seed)
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _load_valid(path: Path) -> GaussianScene:
@@ -232,7 +249,7 @@ def prepare_scene(source: Source, config: TrainConfig, folder: Path) -> Training
         sizes = ()  # it trains on images of single cells
     count = config.views.validation_count if source.is_validation else config.views.count
     scene, file = cache(source.make), source.cameras
-    seen_from = config.seed if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
+    seen_from = config.seed if file is None else _digest(file)
     views = _cached(
         folder / f"{source.name}-views-{_key(source, sizes, count, seen_from)}.safetensors",
         lambda: _packed_views(

@@ -2,7 +2,9 @@
 
 import copy
 import json
+import os
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from statistics import mean
@@ -13,7 +15,7 @@ import torch
 from torch import Tensor
 
 import cvtgs
-from cvtgs.errors import CheckpointError
+from cvtgs.errors import CheckpointError, OutputError
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.mergenet import LearnedScene, MergeNet, Net, load_checkpoint
 from cvtgs.plots import Panel, Series, line_chart
@@ -24,6 +26,53 @@ CURVES: tuple[tuple[Callable[[list[float]], float], str], ...] = (
     (min, "gain of the worst validation scene"),
 )
 """Plotted statistics of the gains over all scenes, and their titles."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainFiles:
+    """Output files of a training.
+
+    Attributes:
+        checkpoint: The network of the best validation so far, or of the last one.
+        state: State to resume from.
+        curves: Plot of the history; not written without matplotlib.
+        cache: Folder of prepared scenes.
+    """
+
+    checkpoint: Path
+    state: Path
+    curves: Path
+    cache: Path
+
+    @classmethod
+    def beside(
+        cls, checkpoint: str | os.PathLike[str], cache: str | os.PathLike[str] | None = None
+    ) -> "TrainFiles":
+        """Return the default paths for a checkpoint.
+
+        Args:
+            checkpoint: Path of the checkpoint.
+            cache: Folder of prepared scenes; None puts it beside the checkpoint.
+
+        Returns:
+            Paths with the stem of the checkpoint.
+
+        Raises:
+            OutputError: The name of the checkpoint does not end in ``.safetensors``.
+
+        Example:
+            >>> TrainFiles.beside(Path("net.safetensors")).curves.name
+            'net.png'
+        """
+        checkpoint = Path(checkpoint)
+        if checkpoint.suffix != ".safetensors":
+            raise OutputError(f"{checkpoint}: the name must end in .safetensors.")
+        return cls(
+            checkpoint=checkpoint,
+            state=checkpoint.with_suffix(".state"),
+            curves=checkpoint.with_suffix(".png"),
+            cache=Path(cache or checkpoint.with_suffix(".cache")),
+        )
 
 
 class Gain(NamedTuple):
@@ -254,8 +303,8 @@ class TrainState:
         odd = [(ours or other).name for ours, other in pairs if ours != other]
         if self.scenes and odd:
             raise CheckpointError(
-                f"{path}: the state belongs to a training run on other scenes or in another "
-                f"order ({odd[0]} differs); restore the scenes, or train to another output."
+                f"{path}: the state belongs to a training run on other scenes, in another order or "
+                f"with other cameras ({odd[0]} differs); restore these, or train to another output."
             )
 
     def _load_tensors(self, tensors: dict[str, Tensor]) -> None:
