@@ -154,6 +154,27 @@ def test_cameras_beside_the_scene_are_read_only_if_levels_use_images(
     assert capsys.readouterr().err.count("cameras are not used") == 1
 
 
+@pytest.mark.slow
+def test_levels_fitted_to_cameras_that_score_are_mentioned(tmp_path, capsys):
+    save(random_scene(200), tmp_path / "a.ply")
+    pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
+    frames = [{"file_path": f"{row}.png", "transform_matrix": pose} for row in range(9)]
+    cameras = tmp_path / "transforms.json"
+    cameras.write_text(json.dumps({"w": 48, "h": 36, "fl_x": 40.0, "frames": frames}))
+    words = ["levels", str(tmp_path / "a.ply"), "-o", str(tmp_path / "levels"), "--rho", "0.1"]
+    words += ["--overwrite", "--views", "1", "--size", "32"]
+    given, split = ["--cameras", str(cameras)], ["--split", "test"]
+    for preset, more, is_mentioned in (
+        ("matched", [], True),
+        ("matched", given, True),
+        ("matched", [*given, *split], False),
+        ("draft", given, False),
+    ):
+        assert main([*words, "--preset", preset, *more]) == 0
+        printed = " ".join(capsys.readouterr().out.split())
+        assert ("Levels were fitted to cameras of which some score" in printed) == is_mentioned
+
+
 def test_levels_need_a_folder_to_write_to(tmp_path, capsys):
     save(random_scene(30), tmp_path / "a.ply")
     (tmp_path / "note").touch()

@@ -180,7 +180,7 @@ def test_columns_that_a_merge_leaves_out_are_listed_as_lost(capsys, source):
 @pytest.mark.parametrize(
     ("count", "text"),
     [
-        (2, "Fitted to all cameras beside in.ply, which favours them if these score: matched."),
+        (2, "Fitted to cameras beside in.ply, which favours them if these score: matched."),
         (32, "Fitted to the training cameras beside in.ply: matched."),
     ],
 )
@@ -198,6 +198,29 @@ def test_presets_that_were_fitted_to_cameras_are_named(capsys, source, count, te
         assert fitted == "28 cameras"
     else:
         assert (views, fitted) == (["0.png", "1.png"], "2 cameras")
+
+
+@pytest.mark.long
+def test_given_cameras_that_presets_are_fitted_to_are_mentioned(capsys, source):
+    """They are those beside the scene, but not only of their test split."""
+    cameras = write_cameras(source.with_name("transforms.json"), 32)
+    words = ["tradeoff", source, "-o", source.with_name("t"), "--rho", "0.3", "--size", "48"]
+    words += ["--lpips", "off", "--overwrite", "--cameras", cameras]
+    for presets, split, shared in (
+        ("draft,matched", [], "6 of the 8 views"),
+        ("draft,matched", ["--split", "test"], ""),
+        ("draft", [], ""),
+    ):
+        assert main([*map(str, words), "--presets", presets, *split]) == 0
+        text = " ".join(capsys.readouterr().err.split())
+        wanted = (
+            f"cvtgs: warning: presets that use images are fitted to {shared} that score, which "
+            f"favours them; the test split of {cameras.parent} has other views."
+        )
+        assert (wanted in text) == bool(shared)
+        assert ("presets that use images" in text) == bool(shared)
+        found = json.loads((source.with_name("t") / "tradeoff.json").read_text())
+        assert found["held_out"] == bool(split)
 
 
 def test_one_gaussian_is_no_plural(capsys, source):

@@ -279,8 +279,8 @@ def add_tradeoff(add_parser: AddParser) -> None:
         parser,
         size=SCORED_SIZE,
         cameras=f"cameras to score from: {CAMERA_FILES} (default: those beside IN or in its "
-        "folder, if they show the scene, else automatic views); presets that use images are not "
-        "fitted to --cameras",
+        "folder, if they show the scene, else automatic views); presets that use images are "
+        "fitted to cameras beside IN, not to these",
         split="split of --cameras to score from (default: all of --cameras)",
         views=f"number of views to score from (default {MOST_CAMERAS}); they are spread evenly "
         "over the cameras, all of which are used if there are fewer",

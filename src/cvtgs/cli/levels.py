@@ -137,6 +137,11 @@ def levels(options: argparse.Namespace) -> None:
             index = cvtgs.levels.add_scores(index, options.output, evaluation)
     if not options.quiet:
         _print_index(index)
+        if is_scored and cameras is not None and config.uses_images and options.split is None:
+            say_wrapped(
+                "Levels were fitted to cameras of which some score, which favours them; with "
+                "--cameras and --split test, others do."
+            )
         older = {path.name for path in options.output.glob("rho_*")} - set(names)
         if older:
             listed = ", ".join(map(printable, sorted(older)))

@@ -251,8 +251,7 @@ def fitted_to(tradeoff: Tradeoff) -> str:
     if tradeoff.held_out:
         return f"Fitted to the training cameras beside {tradeoff.source}: {fitted}. "
     return (
-        f"Fitted to all cameras beside {tradeoff.source}, which favours them if these score: "
-        f"{fitted}. "
+        f"Fitted to cameras beside {tradeoff.source}, which favours them if these score: {fitted}. "
     )
 
 

@@ -23,11 +23,11 @@ from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import InvalidArgumentError, RunError, warn
 from cvtgs.evaluation import Comparison, EvaluationSettings, compare
 from cvtgs.evaluation.scorer import mean_of
-from cvtgs.io import load, scene_file, scene_size
+from cvtgs.io import load, load_cameras, scene_file, scene_size
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import SimplifyReport
 from cvtgs.scene import GaussianScene
-from cvtgs.text import printable_name
+from cvtgs.text import counted, printable_name
 from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult, with_fronts
 from cvtgs.views import automatic_views, find_own_cameras
 
@@ -102,6 +102,11 @@ class Task:
         """Name of the output file."""
         return f"{self.preset}_{self.rho:.15g}.ply"
 
+    @property
+    def uses_images(self) -> bool:
+        """Whether the preset renders images of the scene."""
+        return SimplifyConfig.from_preset(self.preset).uses_images
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
@@ -160,7 +165,7 @@ def run_task(
     words = ["--rho", repr(task.rho), "--preset", task.preset, "--device", device]
     words += [f"--report={report}", "--overwrite", "--quiet"]  # names may begin with a dash
     words += ["--trust-sizes"] * trust_sizes
-    if training is not None and SimplifyConfig.from_preset(task.preset).uses_images:
+    if training is not None and task.uses_images:
         words += [f"--cameras={training}", "--split", "train"]
     words += ["--", os.fspath(source), str(path)]
     try:
@@ -232,6 +237,13 @@ def run_process(command: Sequence[str]) -> ProcessCost:
 def _last_line(errors: str) -> str:
     lines = [line for line in errors.splitlines() if line.strip()]
     return lines[-1].removeprefix("cvtgs: error: ") if lines else ""
+
+
+def _shared(views: Cameras, training: Path) -> int:
+    """Return how many of some views are of training cameras."""
+    cameras = load_cameras(training, split="train")
+    learned, shown = ({*map(str, one.viewmats.tolist())} for one in (cameras, views))
+    return len(learned & shown)
 
 
 class Measured(NamedTuple):
@@ -312,12 +324,17 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
     where = chosen_device(device)
     full = load(source, trust_sizes=trust_sizes).to(where)
     views, own = cameras(full), find_own_cameras(full, source)
-    held_out = own is not None and own.test_cameras() is not None
+    training = own.source if own is not None and own.test_cameras() is not None else None
+    shared = 0 if training is None else _shared(views, training)
+    if shared and any(task.uses_images for task in tasks):
+        warn(
+            f"presets that use images are fitted to {shared} of the {counted(len(views), 'view')} "
+            f"that score, which favours them; the test split of {training} has other views."
+        )
     kept = None if folder is None else nullcontext(folder)
     with kept or TemporaryDirectory(prefix="cvtgs-") as name:
         place = Path(name)
         start = start_seconds()
-        training = own.source if own is not None and held_out else None
         runs, failures, warned = list[Run](), list[Failure](), set[str]()
         for done, task in enumerate(tasks):
             listener(ProgressEvent(stage=STAGE, done=done, total=len(tasks), note=task.name))
@@ -375,6 +392,6 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         evaluation=comparison.evaluation,
         results=tuple(with_fronts(results)),
         failures=tuple(failures),
-        held_out=held_out,
+        held_out=training is not None and not shared,
     )
     return Measured(tradeoff, comparison)

@@ -76,7 +76,8 @@ class Tradeoff(Record):
         evaluation: The views, and the scores per view.
         results: One per ratio and preset, ratio by ratio.
         failures: Runs that failed.
-        held_out: Whether the cameras beside the scene have a test split, to which no run is fitted.
+        held_out: Whether runs are fitted to a training split of the cameras beside the scene, and
+            none of it scores.
     """
 
     source: str
