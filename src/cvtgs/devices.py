@@ -51,10 +51,11 @@ class _Own(threading.local):
 
 
 class _Limits:
-    """Running calls that limit torch, in the whole process, and the number before the first."""
+    """Running calls that limit torch, in the whole process, and its threads before the first."""
 
     lock = threading.Lock()
     setting = threading.Lock()
+    dtype = threading.RLock()  # held while torch's default dtype is another
     running = 0
     threads = 1
 
@@ -280,6 +281,23 @@ def on_host() -> Iterator[None]:
         if torch.get_default_device() != HOST:
             stack.enter_context(HOST)
         yield
+
+
+@contextmanager
+def in_float32() -> Iterator[None]:
+    """Create tensors in float32, whatever the default dtype, for a short time.
+
+    It is that of the whole process, so only one thread at a time may change it.
+    """
+    with _Limits.dtype:
+        dtype = torch.get_default_dtype()
+        if dtype != torch.float32:
+            torch.set_default_dtype(torch.float32)
+        try:
+            yield
+        finally:
+            if dtype != torch.float32:
+                torch.set_default_dtype(dtype)
 
 
 @contextmanager

@@ -89,6 +89,8 @@ def test_a_configuration_is_frozen():
         ("[data]\nfolder = 'x'", "data.folder: is not a known setting."),
         ("[view]\ncount = 3", "view: is not a known setting."),
         ("steps = 9\nrestart_step = 9", "restart_step must be below the 9 steps, found 9."),
+        ("width = 1025", "width: input should be less than or equal to 1024, found 1025."),
+        ("cell_width = 5000", "cell_width: input should be less than or equal to 4096"),
         ("steps = 0", "steps: input should be greater than or equal to 1, found 0."),
         ("kind = 'both'", "kind: input should be 'scene', 'local' or 'published', found 'both'."),
         ("preset = 'best'", "preset: input should be 'standard' or 'paper', found 'best'."),

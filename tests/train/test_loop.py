@@ -10,6 +10,8 @@ import cvtgs
 from cvtgs.errors import (
     CheckpointError,
     ConfigError,
+    DeviceError,
+    InvalidArgumentError,
     InvalidSceneError,
     MissingDependencyError,
     OutputError,
@@ -17,7 +19,7 @@ from cvtgs.errors import (
 )
 from cvtgs.mergenet import load_checkpoint
 from cvtgs.progress import ProgressEvent
-from cvtgs.train import Gain, History, TrainConfig, TrainFiles
+from cvtgs.train import Gain, History, TrainConfig, TrainFiles, train
 from cvtgs.train import loop as train_loop
 from train_cases import bits_of, run, small_scene, tiny_config, tiny_data, write_scenes
 
@@ -58,7 +60,20 @@ def test_files_are_named_after_the_checkpoint():
     assert files.checkpoint == Path("out/net.v2.safetensors")
     assert (files.state, files.curves) == (Path("out/net.v2.state"), Path("out/net.v2.png"))
     assert files.cache == Path("out/net.v2.cache")
-    assert TrainFiles.beside(Path("a.safetensors"), Path("c")).cache == Path("c")
+    assert TrainFiles.beside("a.safetensors", "c").cache == Path("c")
+    for name in ("net.png", "net.state", "net"):  # two of its files would be one
+        with pytest.raises(OutputError, match="the name must end in"):
+            TrainFiles.beside(name)
+
+
+def test_arguments_of_another_kind_are_named(scenes, tmp_path):
+    files = TrainFiles.beside(tmp_path / "net.safetensors")
+    with pytest.raises(InvalidArgumentError, match="files must be of type TrainFiles, found str"):
+        train(config_of(scenes), "net.safetensors")
+    with pytest.raises(InvalidArgumentError, match="config must be of type TrainConfig"):
+        train({}, files)
+    with pytest.raises(DeviceError, match="cudaa"):
+        train(config_of(scenes), files, device="cudaa")
 
 
 @pytest.mark.slow
@@ -279,6 +294,16 @@ def test_a_cache_that_is_a_file_is_an_error(scenes, tmp_path):
     with pytest.raises(OutputError, match="must be a folder or a new path"):
         run(config_of(scenes), tmp_path / "net.safetensors", tmp_path / "cache")
     assert (tmp_path / "cache").read_text() == "precious"
+
+
+def test_curves_that_cannot_be_drawn_do_not_end_a_training(scenes, cache, tmp_path, monkeypatch):
+    def curves(history: History) -> bytes:
+        raise ValueError("Key backend: 'bogus' is not a valid value")
+
+    monkeypatch.setattr(History, "curves", curves)
+    with pytest.warns(UserWarning, match="the curves are not drawn: Key backend: 'bogus'"):
+        history = run(config_of(scenes, steps=1), tmp_path / "net.safetensors", cache)
+    assert [entry.step for entry in history.validations] == [0, 1]
 
 
 def test_without_matplotlib_there_is_a_network_and_no_image(scenes, cache, tmp_path, monkeypatch):

@@ -230,9 +230,27 @@ def test_the_curves_cover_the_whole_training(scenes, cache, tmp_path):
 @pytest.mark.usefixtures("_quick_curves")
 @pytest.mark.slow
 def test_the_checkpoint_of_another_training_is_refused(scenes, cache, tmp_path):
+    """It has another seed, or is the network of a step that this training did not keep."""
     path = tmp_path / "net.safetensors"
-    run(config_of(scenes), path, cache)
-    run(config_of(scenes, seed=5), tmp_path / "other.safetensors", cache)
-    path.write_bytes((tmp_path / "other.safetensors").read_bytes())
-    with pytest.raises(CheckpointError, match="other scenes or with another seed than"):
-        run(config_of(scenes), path, cache, resume=True)
+    run(config_of(scenes, keep="last"), path, cache)
+    for changes in ({"seed": 5}, {"steps": STEPS - 2}):
+        run(config_of(scenes, keep="last", **changes), tmp_path / "other.safetensors", cache)
+        path.write_bytes((tmp_path / "other.safetensors").read_bytes())
+        with pytest.raises(CheckpointError, match="the network is of another training run than"):
+            run(config_of(scenes, keep="last"), path, cache, resume=True)
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("_quick_curves")
+def test_settings_of_torch_do_not_change_the_network(scenes, cache, tmp_path):
+    """Neither a default dtype or device, nor autocast, nor that gradients are off."""
+    whole, other = tmp_path / "whole.safetensors", tmp_path / "other.safetensors"
+    config = config_of(scenes, steps=2)
+    run(config, whole, cache)
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.device("meta"), torch.autocast("cpu"), torch.inference_mode():
+            run(config, other, tmp_path / "other cache")
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert_same_files(other, whole)

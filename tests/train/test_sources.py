@@ -187,7 +187,10 @@ def test_invalid_rows_of_a_file_are_left_out(tmp_path):
         ({"folders": ["nowhere"]}, "data.folders: {0}/nowhere is not a folder."),
         ({"folders": ["."]}, "data.folders: {0} holds no PLY file."),
         ({"folders": ["some"], "validation": ("x",)}, "data.validation: no file named x.ply in"),
-        ({"folders": ["some", "some"]}, "data.folders: two files have the same name."),
+        (
+            {"folders": ["some", "some"]},
+            "data.folders: 2 scenes would be named a, of {0}/some/",
+        ),
         (
             {"folders": ["some"], "validation": ("a", "exam")},
             "data: at least one training scene is needed, found none.",

@@ -13,11 +13,13 @@ from torch import Tensor
 
 from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.config.base import Record
+from cvtgs.devices import in_float32
 from cvtgs.errors import (
     CheckpointError,
     ConfigError,
     FileFormatError,
     InvalidArgumentError,
+    check_path,
     reason_of,
 )
 from cvtgs.io.tensors import pack_tensors, unpack_tensors
@@ -120,11 +122,13 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
     Raises:
         CheckpointError: There is no such file, or it is not a checkpoint, is damaged, or has a
             later format or another architecture.
+        InvalidArgumentError: ``source`` is no path.
 
     Example:
         >>> load_checkpoint("standard").info.preset
         'standard'
     """
+    check_path(source)
     name = os.fspath(source)
     path = Path(name)
     if name in SHIPPED:
@@ -245,7 +249,7 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
 
 def build_network(architecture: Architecture | PublishedArchitecture) -> Net:
     """Build an untrained network in float32 on the CPU, which changes nothing."""
-    with torch.device("cpu"):  # the program may have other defaults
+    with in_float32(), torch.device("cpu"):  # the program may have other defaults
         if isinstance(architecture, PublishedArchitecture):
             return PublishedMergeNet(architecture).float()
         return MergeNet(architecture).float()

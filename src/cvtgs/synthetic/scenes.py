@@ -1,6 +1,5 @@
 """Generate a scene from a kind, a count and a seed, chunk by chunk."""
 
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -8,7 +7,7 @@ import torch
 from torch import Tensor
 
 from cvtgs.counts import whole_number
-from cvtgs.devices import one_thread, without_autocast
+from cvtgs.devices import in_float32, one_thread, without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
@@ -19,7 +18,6 @@ from cvtgs.text import shown
 
 KINDS = tuple(LAYOUTS)  # the kinds of scenes that can be made
 _CHUNK = 1 << 15  # rows that are drawn together; this many fit into the cache of one core
-_DEFAULT_DTYPE = threading.RLock()  # held while torch's default dtype is float32 for scenes
 
 
 def scene(kind: str, count: int, *, sh_degree: int = 3, seed: int = 0) -> GaussianScene:
@@ -95,19 +93,9 @@ def demo_scene(count: int = 200_000, *, sh_degree: int = 3, seed: int = 0) -> Ga
 
 @contextmanager
 def _settings() -> Iterator[None]:
-    """Set torch to float32, the CPU and one thread; chunks are too small for more.
-
-    The default dtype is that of the whole process, so only one thread at a time may change it.
-    """
-    with _DEFAULT_DTYPE, one_thread(), torch.device("cpu"), without_autocast():
-        dtype = torch.get_default_dtype()
-        if dtype != torch.float32:
-            torch.set_default_dtype(torch.float32)
-        try:
-            yield
-        finally:
-            if dtype != torch.float32:
-                torch.set_default_dtype(dtype)
+    """Set torch to float32, the CPU and one thread; chunks are too small for more."""
+    with in_float32(), one_thread(), torch.device("cpu"), without_autocast():
+        yield
 
 
 def _draw_parts(

@@ -15,13 +15,15 @@ from torch import Tensor
 import cvtgs
 from cvtgs.checks import checked
 from cvtgs.clock import check_listener
-from cvtgs.devices import chosen_device, on_host, thread_count, without_autocast
+from cvtgs.devices import chosen_device, in_float32, on_host, thread_count, without_autocast
 from cvtgs.errors import (
     CheckpointError,
     ConfigError,
     InvalidSceneError,
     MissingDependencyError,
+    OutputError,
     TrainingError,
+    warn,
 )
 from cvtgs.evaluation.scorer import ViewImages
 from cvtgs.io.atomic import make_folder, write_atomically
@@ -38,6 +40,7 @@ from cvtgs.mergenet import (
 from cvtgs.mergenet.checkpoint import build_network
 from cvtgs.processes import LocalWorkers, can_start_processes
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
+from cvtgs.text import shortened
 from cvtgs.train.cases import Case, DeviceCopies
 from cvtgs.train.config import TrainConfig
 from cvtgs.train.losses import local_loss, published_loss, scene_loss, validation_psnr
@@ -284,7 +287,8 @@ def _step(
                 f"last good checkpoint: {good}."
             )
     torch.nn.utils.clip_grad_norm_(state.net.parameters(), LARGEST_GRADIENT)
-    state.optimizer.step()
+    with in_float32():  # Adam counts its steps in the default dtype
+        state.optimizer.step()
     state.average()
     state.step += 1
     return sum(result.loss for result in results) / len(results)
@@ -323,11 +327,18 @@ def _validate(
 
 
 def _draw_curves(history: History, files: TrainFiles) -> None:
+    """Write the image of the curves if that is possible: no training is lost for it."""
     try:
         curves = history.curves()
     except MissingDependencyError:
-        return  # do not lose hours of training for a plot
-    write_atomically(files.curves, curves, overwrite=True)
+        return
+    except Exception as error:  # of matplotlib: a backend that is not there, for example
+        warn(f"the curves are not drawn: {shortened(str(error), 200)}")
+        return
+    try:
+        write_atomically(files.curves, curves, overwrite=True)
+    except OutputError as error:
+        warn(f"the curves are not saved: {error}")
 
 
 def _restore_checkpoint(state: TrainState, config: TrainConfig, files: TrainFiles) -> None:
@@ -335,12 +346,15 @@ def _restore_checkpoint(state: TrainState, config: TrainConfig, files: TrainFile
     if state.history.validations and not files.curves.is_file():
         _draw_curves(state.history, files)
     if files.checkpoint.is_file():
-        info = load_checkpoint(files.checkpoint).info
-        if (info.scenes, info.seed) != (state.scenes, config.seed):
+        info, best = load_checkpoint(files.checkpoint).info, state.history.best()
+        own = state.step if best is None or config.keep == "last" else best.step
+        # It is written before the state, so it may be of a later validation.
+        is_own = info.steps == own or info.steps > state.step
+        if (info.scenes, info.seed, is_own) != (state.scenes, config.seed, True):
             raise CheckpointError(
-                f"{files.checkpoint}: the network is of a training run on other scenes or with "
-                f"another seed than {files.state}; restore or remove the file, or train to "
-                f"another output."
+                f"{files.checkpoint}: the network is of another training run than {files.state}: "
+                f"on other scenes, with another seed or of another step; restore or remove the "
+                f"file, or train to another output."
             )
         return
     if config.keep == "best" and state.history.since_best() > 0:

@@ -276,8 +276,8 @@ class _Placement:
     def draw(cls, merged: GaussianScene, side: int, rng: random.Random, apart: int) -> "_Placement":
         count = len(merged)
         generator = torch.Generator().manual_seed(rng.getrandbits(62))
-        quats = torch.randn(count, 4, generator=generator)
-        draws = torch.rand(count, 3, generator=generator)
+        quats = torch.randn(count, 4, generator=generator, dtype=torch.float32)
+        draws = torch.rand(count, 3, generator=generator, dtype=torch.float32)
         tiles = torch.arange(count)
         positions = torch.stack(
             [

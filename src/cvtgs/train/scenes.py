@@ -69,13 +69,13 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
     if missing:
         raise ConfigError(f"data.validation: no file named {missing[0]}.ply in data.folders.")
     sources = [*_from_files(files, held_out, config, seed), *_generated(config, seed)]
-    name, times = Counter(source.name for source in sources).most_common(1)[0]
-    if times > 1:
-        named = ", ".join(str(path) for path in files if path.stem == name)
-        raise ConfigError(
-            f"data.folders: {times} scenes would be named {name}, of {named}; use a file once, and "
-            f"rename others."
-        )
+    for name, times in Counter(source.name for source in sources).most_common(1):
+        if times > 1:
+            named = ", ".join(str(path) for path in files if path.stem == name)
+            raise ConfigError(
+                f"data.folders: {times} scenes would be named {name}, of {named}; use a file once, "
+                f"and rename others."
+            )
     for is_validation, text in ((False, "training"), (True, "validation")):
         if not any(source.is_validation == is_validation for source in sources):
             raise ConfigError(f"data: at least one {text} scene is needed, found none.")
@@ -85,7 +85,8 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
 def _files_in(folder: Path) -> list[Path]:
     if not is_folder(folder):
         raise ConfigError(f"data.folders: {folder} is not a folder.")
-    files = sorted(path for path in folder.rglob("*.ply") if not _is_hidden(path, folder))
+    found = (path for path in folder.rglob("*") if path.suffix.lower() == ".ply")
+    files = sorted(path for path in found if not _is_hidden(path, folder))
     if not files:
         raise ConfigError(f"data.folders: {folder} holds no PLY file.")
     return files
@@ -204,15 +205,16 @@ def perturb(scene: GaussianScene, rng: random.Random) -> GaussianScene:
     """
     generator = torch.Generator().manual_seed(rng.getrandbits(62))
     share = rng.uniform(0.4, 1.0)
-    kept = scene.select(torch.rand(len(scene), generator=generator) < share)
+    draws = torch.rand(len(scene), generator=generator, dtype=torch.float32)
+    kept = scene.select(draws < share)
     kept = kept if len(kept) else scene
     stretch = torch.tensor([rng.uniform(0.6, 1.5) for _ in range(3)], dtype=scene.dtype)
     wider = share ** (-1 / 3)
     quats = parameters.normalize_quats(kept.quats.double())
     shapes = parameters.build_covariances(kept.scales.double() * wider, quats)
     scales, turned = parameters.decompose_covariances(shapes * stretch[:, None] * stretch)
-    mix = torch.eye(3) * rng.uniform(0.5, 1.4) + 0.3 * torch.randn(3, 3, generator=generator)
-    mix = mix.to(scene.dtype)
+    noise = torch.randn(3, 3, generator=generator, dtype=torch.float32)
+    mix = (torch.eye(3) * rng.uniform(0.5, 1.4) + 0.3 * noise).to(scene.dtype)
     changed = kept.with_tensors(
         {
             "means": kept.means * stretch,
