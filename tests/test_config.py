@@ -168,6 +168,14 @@ def test_the_constructor_starts_from_the_preset(name):
             "match.band_ridge: input should be greater than or equal to 0.000000001, found 1e-45.",
         ),
         (
+            {"refine": {"mse_weight": 0, "image_weight": 0.0}},
+            "one of refine.mse_weight and refine.image_weight must be above 0.",
+        ),
+        (
+            {"allocation": {"widest": 1e300}},
+            "allocation.widest: input should be less than or equal to 1000000000, found 1e+300.",
+        ),
+        (
             {"filter": {"min_opacity": 1.5}},
             "filter.min_opacity: input should be less than or equal to 1, found 1.5.",
         ),

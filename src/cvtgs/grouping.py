@@ -12,6 +12,7 @@ from torch import Tensor
 from cvtgs import cells, cvt
 from cvtgs.analysis import SceneAnalysis
 from cvtgs.config import AllocationConfig, SimplifyConfig
+from cvtgs.counts import checked_whole
 from cvtgs.cvt.nearest import search_device
 from cvtgs.devices import move_together
 from cvtgs.filters import filter_rows
@@ -172,8 +173,12 @@ def tessellate_rows(
 
     Returns:
         The tessellation.
+
+    Raises:
+        InvalidArgumentError: ``target`` is no whole number from 1 to k.
     """
     scene, rows = points.scene, points.rows
+    target = checked_whole(target, "target", most=len(rows), things="Gaussians")
     count = finer_count(target, len(rows), config.allocation)
     if count == len(rows):  # every Gaussian is its own cell, so the space does not matter
         space = scene.means.index_select(0, rows)

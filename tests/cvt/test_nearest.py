@@ -56,6 +56,14 @@ def assert_nearest(points, sites, found):
     torch.testing.assert_close(of_labels, wanted, rtol=1e-12, atol=1e-30)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_short_floats_are_searched(dtype):
+    points = torch.arange(5.0)[:, None].to(dtype)
+    labels, squared = nearest_scipy(points + 0.25, points)
+    assert labels.tolist() == [0, 1, 2, 3, 4]
+    assert squared.tolist() == [0.0625] * 5
+
+
 def test_brute_force_equals_the_scalar_oracle():
     points, sites = cloud("lattice", 60, 3), cloud("lattice", 20, 3, seed=1)
     labels, squared = oracles.nearest(points.numpy(), sites.numpy())

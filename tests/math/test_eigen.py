@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import eigen
 from cvtgs.math.eigen import jacobi_eigen, symmetric_eigen
 from pretended_device import pretended_cuda
@@ -33,6 +34,13 @@ def test_rotations_find_the_same(sizes, dtype, tolerance):
     torch.testing.assert_close((axes * values[:, None]) @ axes.mT, made, **close)
     unit = torch.eye(3, dtype=dtype).expand(len(made), 3, 3)
     torch.testing.assert_close(axes.mT @ axes, unit, **close)
+
+
+def test_values_that_are_not_finite_are_one_clear_error():
+    matrices = torch.eye(3).repeat(5, 1, 1)
+    matrices[3] = torch.nan
+    with pytest.raises(InvalidArgumentError, match="covariances must be finite, found NaN"):
+        symmetric_eigen(matrices)
 
 
 def test_diagonal_matrices_stay_exact():

@@ -9,6 +9,7 @@ import torch
 import regenerate_golden as golden
 from cvtgs import GaussianScene
 from cvtgs.cells import Partition
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.mergenet import correct_cells
 from mergenet_cases import Case, case_of, lively_net, some_case, some_labels
 from scenes import assert_same_gaussians, moved, random_scene, same_bits
@@ -185,6 +186,23 @@ def test_float32_agrees_with_float64(seed):
     double = double_of(case).correct(lively_net(seed=seed))
     assert single.dtype == torch.float32
     assert_close(single, double, 5e-6)
+
+
+def test_a_network_of_another_dtype_is_refused():
+    case, net = double_of(some_case()), lively_net(torch.float32)
+    with pytest.raises(InvalidArgumentError) as caught:
+        case.correct(net)
+    assert str(caught.value) == (
+        "the network must have the dtype of the scene, torch.float64, found torch.float32; "
+        "net.copy_to(scene.device, scene.dtype) returns one that has."
+    )
+    case.correct(net.copy_to(torch.device("cpu"), torch.float64))
+
+
+def test_ambient_visibility_is_needed_for_every_gaussian():
+    case = some_case()
+    with pytest.raises(InvalidArgumentError, match=r"visibility must be a number for each of"):
+        case._replace(visibility=case.visibility[:0]).correct(lively_net())
 
 
 def test_input_is_not_changed():

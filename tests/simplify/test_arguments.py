@@ -1,5 +1,6 @@
 """Wrong arguments of Simplifier: the error names the right one."""
 
+import math
 import re
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import torch
 
 import cvtgs
 from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.analysis import analyze
 from cvtgs.errors import (
     CheckpointError,
     ConfigError,
@@ -15,6 +17,7 @@ from cvtgs.errors import (
     InputNotFoundError,
     InvalidArgumentError,
 )
+from cvtgs.grouping import tessellate_rows, weigh_rows
 from cvtgs.prepared import check_cameras
 from cvtgs.refinement import RefineConfig
 from cvtgs.rendering import contributions
@@ -152,14 +155,34 @@ def simplify_by_hand():
 @pytest.mark.parametrize("preset", ["standard", "paper"])
 @pytest.mark.parametrize(
     "scene",
-    [random_scene(600, degree=2), cvtgs.synthetic.scene("landscape", 1500, sh_degree=1, seed=2)],
-    ids=["random", "landscape"],
+    [
+        random_scene(600, degree=2),
+        random_scene(300, degree=1, dtype=torch.float64),
+        cvtgs.synthetic.scene("landscape", 1500, sh_degree=1, seed=2),
+    ],
+    ids=["random", "float64", "landscape"],
 )
 @pytest.mark.slow
 def test_stages_by_hand_give_the_bits_of_the_simplifier(simplify_by_hand, scene, preset):
     whole = cvtgs.Simplifier(preset, device="cpu").simplify(scene, count=90)
     assert same_bits(simplify_by_hand(scene, 90, preset), whole)
     assert not same_bits(whole, cvtgs.Simplifier(preset, device="cpu").simplify(scene, count=89))
+
+
+@pytest.mark.parametrize("target", [0, 0.05, 20.5, 31, math.nan])
+def test_targets_of_a_tessellation_are_whole_numbers(target):
+    scene, config = random_scene(30), SimplifyConfig()
+    analysis = analyze(scene, config)
+    points = weigh_rows(scene, torch.arange(30), analysis, config)
+    with pytest.raises(InvalidArgumentError, match="target must be a whole number"):
+        tessellate_rows(points, analysis, target, config)
+
+
+def test_analyses_are_of_scenes():
+    with pytest.raises(InvalidArgumentError, match="scene must be of type GaussianScene"):
+        analyze("scene.ply", SimplifyConfig())
+    with pytest.raises(InvalidArgumentError, match="an empty scene cannot be analyzed"):
+        analyze(random_scene(3)[:0], SimplifyConfig())
 
 
 def test_arguments_of_another_kind_are_one_sentence(tmp_path):

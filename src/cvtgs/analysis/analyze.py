@@ -17,8 +17,10 @@ from cvtgs.analysis.effects import (
     plan_haze,
 )
 from cvtgs.cameras import Cameras
+from cvtgs.checks import checked
 from cvtgs.config import SimplifyConfig, TessellationConfig
 from cvtgs.devices import row_chunks
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.losses import SSIM_WINDOW
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import divide
@@ -88,6 +90,7 @@ class SceneAnalysis:
         )
 
 
+@checked
 def analyze(
     scene: GaussianScene, config: SimplifyConfig, *, with_visibility: bool = False
 ) -> SceneAnalysis:
@@ -101,12 +104,17 @@ def analyze(
     Returns:
         Frame, areas, visibility and effect plan.
 
+    Raises:
+        InvalidArgumentError: The scene is empty, or an argument has another type.
+
     Example:
         >>> from cvtgs.synthetic import scene as make
         >>> analysis = analyze(make("object", 100, sh_degree=0, seed=0), SimplifyConfig())
         >>> analysis.plan.unbounded.active, len(analysis.areas)
         (False, 100)
     """
+    if len(scene) == 0:
+        raise InvalidArgumentError("an empty scene cannot be analyzed.")
     areas, opacities = scene.areas, scene.opacities
     frame = frame_of(scene.means, opacities)
     distances, masses = frame.distances(scene.means), areas * opacities

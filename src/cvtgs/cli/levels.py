@@ -30,6 +30,7 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.text import counted, printable, size_text
 
 if TYPE_CHECKING:
+    from cvtgs.cameras import Cameras
     from cvtgs.evaluation import Evaluation
     from cvtgs.levels import LevelsIndex
     from cvtgs.progress import ProgressListener
@@ -107,12 +108,7 @@ def levels(options: argparse.Namespace) -> None:
         scene = cvtgs.load(options.input, axes=axes.source, trust_sizes=options.trust_sizes)
         if options.sh_degree is not None:
             scene = scene.with_sh_degree(options.sh_degree)
-        cameras = None
-        if options.cameras is not None:  # scores are by the split, so levels do not learn from it
-            cameras = cvtgs.load_cameras(options.cameras, split=options.split and "train")
-        if cameras is None and axes.source is None and config.uses_images:
-            own = cvtgs.views.find_own_cameras(scene, options.input)
-            cameras = None if own is None else own.cameras
+        cameras = _cameras_to_fit(options, scene) if config.uses_images else None
         if is_scored and options.cameras is not None:
             _check_seen(options, scene)
         made = simplifier.levels(scene, rhos, cameras=cameras)
@@ -137,7 +133,7 @@ def levels(options: argparse.Namespace) -> None:
             index = cvtgs.levels.add_scores(index, options.output, evaluation)
     if not options.quiet:
         _print_index(index)
-        if is_scored and cameras is not None and config.uses_images and options.split is None:
+        if is_scored and cameras is not None and options.split is None:
             say_wrapped(
                 "Levels were fitted to cameras of which some score, which favours them; with "
                 "--cameras and --split test, others do."
@@ -160,6 +156,16 @@ def _check_input(options: argparse.Namespace, names: Sequence[str]) -> None:
                 f"{options.output / name}: a level must not replace the scene; choose another "
                 f"folder."
             )
+
+
+def _cameras_to_fit(options: argparse.Namespace, scene: "GaussianScene") -> "Cameras | None":
+    """Read the cameras for presets that use images: not the split, by which levels are scored."""
+    if options.cameras is not None:
+        return cvtgs.load_cameras(options.cameras, split=options.split and "train")
+    if read_axes(options.axes).source is not None:
+        return None
+    own = cvtgs.views.find_own_cameras(scene, options.input)
+    return None if own is None else own.cameras
 
 
 def _check_seen(options: argparse.Namespace, scene: "GaussianScene") -> None:

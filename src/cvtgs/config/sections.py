@@ -6,10 +6,13 @@ from typing import Annotated, Literal, Self
 import pydantic
 
 from cvtgs.config.base import Section
+from cvtgs.errors import ConfigError
 
 Share = Annotated[float, pydantic.Field(ge=0.0, le=1.0)]
 Rate = Annotated[float, pydantic.Field(ge=0.0)]
 Count = Annotated[int, pydantic.Field(ge=1)]
+Stride = Annotated[int, pydantic.Field(ge=1, le=64)]
+Factor = Annotated[float, pydantic.Field(ge=0.0, le=1e9)]  # its square fits into float32
 Ridge = Annotated[float, pydantic.Field(ge=1e-9, le=1e9)]  # products of two fit into float32
 Choice = Literal["auto", "on", "off"]
 Less = Literal["auto", "off"]
@@ -101,12 +104,12 @@ class TessellationConfig(Section):
     area_power: float = pydantic.Field(default=0.4, ge=0.0, le=2.0)
     perspective: bool = True
     hidden_share: Share = 0.1
-    weight_floor: float = pydantic.Field(default=1e-3, ge=0.0)
-    color: float = pydantic.Field(default=0.05, ge=0.0)
+    weight_floor: Factor = 1e-3
+    color: Factor = 0.05
     color_power: float = pydantic.Field(default=-0.25, ge=-1.0, le=1.0)
     seeding: Literal["stratified", "weighted"] = "stratified"
     iterations: int = pydantic.Field(default=2, ge=0)
-    tolerance: float = pydantic.Field(default=1e-3, ge=0.0)
+    tolerance: Factor = 1e-3
     samples_per_site: int = pydantic.Field(default=3, ge=0)
 
 
@@ -139,12 +142,12 @@ class AllocationConfig(Section):
 
     oversampling: float = pydantic.Field(default=8.0, ge=1.0, le=64.0)
     neighbors: int = pydantic.Field(default=6, ge=1, le=64)
-    color: float = pydantic.Field(default=50.0, ge=0.0)
+    color: Factor = 50.0
     color_power: float = pydantic.Field(default=0.3, ge=0.0, le=1.0)
-    view_color: float = pydantic.Field(default=2.0, ge=0.0)
+    view_color: Factor = 2.0
     mass_power: float = pydantic.Field(default=0.5, ge=0.0, le=2.0)
     far_relief: Share = 0.55
-    widest: float = pydantic.Field(default=0.55, ge=0.0)
+    widest: Factor = 0.55
     reassign: bool = True
 
     @property
@@ -157,7 +160,7 @@ class ImageSection(Section):
     """Base of the sections that render images of the scene."""
 
     size: int = pydantic.Field(default=128, ge=16)
-    stride: Count = 1
+    stride: Stride = 1
     fine_factor: Count = 1
 
 
@@ -323,6 +326,12 @@ class RefineConfig(ImageSection):
     check_every: Count = 25
     patience: Count = 8
     lengthening: float = pydantic.Field(default=1.0, ge=1.0, le=16.0)
+
+    @pydantic.model_validator(mode="after")
+    def _check_weights(self) -> Self:
+        if self.mse_weight == 0.0 == self.image_weight:
+            raise ConfigError("one of refine.mse_weight and refine.image_weight must be above 0.")
+        return self
 
     def thinning(self, count: int) -> int:
         """Return which pixels of an image a step uses.

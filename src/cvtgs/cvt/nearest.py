@@ -102,7 +102,7 @@ def nearest_scipy(
     squared = np.empty(len(points), dtype=np.float64)
 
     def search(part: slice) -> None:
-        distances, labels[part] = tree.query(np.asarray(points[part], np.float64))
+        distances, labels[part] = tree.query(points[part].double().numpy())
         np.square(distances, out=squared[part])
 
     _in_threads(search, len(points))
@@ -159,7 +159,7 @@ def build_tree(sites: Float[Tensor, "m d"]) -> Any:
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 (heavy; `import cvtgs` stays light)
 
-    return cKDTree(np.asarray(sites, dtype=np.float64), balanced_tree=False)
+    return cKDTree(sites.double().numpy(), balanced_tree=False)
 
 
 @checked

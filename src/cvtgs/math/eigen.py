@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.errors import InvalidArgumentError
+
 SWEEPS = 5
 """Rotations of all three planes. In float64, four leave only rounding errors; one is spare."""
 
@@ -17,7 +19,13 @@ def symmetric_eigen(
     for half a megabyte for each). There, Jacobi rotations (1846) diagonalise all matrices at once.
     """
     if matrices.device.type != "cuda":
-        values, axes = torch.linalg.eigh(matrices)
+        try:
+            values, axes = torch.linalg.eigh(matrices)
+        except RuntimeError:  # of torch.linalg, for NaN
+            raise InvalidArgumentError(
+                "covariances must be finite, found NaN or infinity; cvtgs.validity.check_rows "
+                "removes Gaussians with such values."
+            ) from None
         return values, axes
     return jacobi_eigen(matrices)
 

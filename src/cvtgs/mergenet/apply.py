@@ -10,6 +10,7 @@ from torch import Tensor
 from cvtgs.cells import Partition
 from cvtgs.cells.features import NeighborContext, describe_members, neighbor_context
 from cvtgs.devices import chunk_length, in_threads
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import parameters
 from cvtgs.math.segments import segment_sum, segment_sum_of
 from cvtgs.mergenet.model import MergeNet, Residuals
@@ -36,7 +37,7 @@ def correct_cells(  # noqa: PLR0913 (options by name)
     """Correct every merged Gaussian of several members with a network.
 
     Args:
-        net: The network, on the device of the scene.
+        net: The network, of the device and dtype of the scene (:meth:`CellNetwork.copy_to`).
         scene: The Gaussians, with valid rows.
         merged: One Gaussian per cell: first those of the partition, then others that serve only
             as neighbours.
@@ -49,6 +50,10 @@ def correct_cells(  # noqa: PLR0913 (options by name)
 
     Returns:
         The scene with corrected Gaussians.
+
+    Raises:
+        InvalidArgumentError: The network has another dtype than the scene, or needs a visibility
+            of every Gaussian.
 
     Example:
         >>> from cvtgs.cells import merge_cells
@@ -66,6 +71,12 @@ def correct_cells(  # noqa: PLR0913 (options by name)
         >>> bool((corrected.means == merged.means).all())
         True
     """
+    dtype = next(net.parameters()).dtype
+    if dtype != scene.dtype:
+        raise InvalidArgumentError(
+            f"the network must have the dtype of the scene, {scene.dtype}, found {dtype}; "
+            f"net.copy_to(scene.device, scene.dtype) returns one that has."
+        )
     sizes = partition.counts if sizes is None else sizes
     cells, several = partition.select_several()
     done = len(partition) - len(cells)
@@ -118,6 +129,11 @@ def _correct_gated(  # noqa: PLR0913 (options by name)
     pixel_size: float,
 ) -> Generator[tuple[Int[Tensor, "r"], dict[str, Tensor]], None, None]:
     """Yield runs of cells and their corrected tensors."""
+    if len(visibility) != len(scene):
+        raise InvalidArgumentError(
+            f"visibility must be a number for each of {len(scene):,} Gaussians, found "
+            f"{len(visibility):,}; analyze(..., with_visibility=True) computes it."
+        )
     chunk, near = chunk_length(CHUNK_MEMBERS, scene.device), neighbors.shape[1]
     step = max(1, chunk // max(1, near))
 
