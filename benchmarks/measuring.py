@@ -16,7 +16,7 @@ import cvtgs
 from cvtgs.devices import device_name
 from cvtgs.errors import RunError
 from cvtgs.io import atomic_output
-from cvtgs.tradeoff.measure import run_process
+from cvtgs.tradeoff.process_cost import run_process
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

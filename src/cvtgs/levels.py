@@ -15,7 +15,7 @@ from cvtgs.evaluation import Evaluation, SceneScores
 from cvtgs.evaluation.scorer import mean_of
 from cvtgs.io import check_output, check_save, load, save
 from cvtgs.io.atomic import make_folder, write_atomically
-from cvtgs.io.axes import SCENE_AXES
+from cvtgs.io.axes import SCENE_AXES, checked_axes
 from cvtgs.report import Level
 from cvtgs.text import counted, printable_name, shown
 
@@ -158,7 +158,8 @@ def write_levels(
         >>> [(level.file, level.count) for level in index.levels]
         [('rho_0.1.ply', 50), ('rho_0.02.ply', 10)]
     """
-    if not levels or not all(isinstance(level, Level) for level in levels):
+    is_list = isinstance(levels, Sequence) and len(levels) > 0
+    if not is_list or not all(isinstance(level, Level) for level in levels):
         raise InvalidArgumentError(
             f"levels must be those that Simplifier.levels returns, found {shown(levels)}."
         )
@@ -168,6 +169,8 @@ def write_levels(
             f"levels must be of one scene, found scenes of {sizes[0]:,} and {sizes[1]:,} Gaussians."
         )
     check_path(source)
+    check_path(folder)
+    checked_axes(axes or SCENE_AXES)
     ratios = written_ratios(rhos)
     if len(ratios) != len(levels):
         raise InvalidArgumentError(

@@ -14,14 +14,15 @@ from cvtgs.budget import find_count
 from cvtgs.budget.count import (
     CLOSE,
     HELDOUT_SEED,
+    Target,
     heldout_quality,
     heldout_scorer,
     smallest_enough,
 )
-from cvtgs.errors import DroppedDataWarning, GoalError, InvalidArgumentError
+from cvtgs.errors import DroppedDataWarning, GoalError, InvalidArgumentError, InvalidSceneError
 from cvtgs.progress import silent
 from cvtgs.views import automatic_views
-from scenes import same_bits
+from scenes import random_scene, same_bits
 
 
 def search(values, wanted: float, most: int) -> list[tuple[int, float]]:
@@ -50,6 +51,17 @@ def test_cameras_that_miss_the_scene_are_refused():
     scene = scene.with_tensors(means=means, logit_opacities=logits)
     with pytest.raises(InvalidArgumentError, match="must see the scene, found nothing of it"):
         find_count(scene, psnr=20.0, heldout=replace(views, viewmats=away))
+
+
+def test_a_goal_that_is_nearly_reached_has_more_digits():
+    assert Target("psnr", 55.734).missed(55.731) == ("55.734 dB", "55.731 dB")
+    assert Target("psnr", 40.0).missed(31.2) == ("40.00 dB", "31.20 dB")
+    assert Target("ssim", 0.99999999).missed(0.999971) == ("SSIM 1.00000", "SSIM 0.99997")
+
+
+def test_an_empty_scene_is_named(views):
+    with pytest.raises(InvalidSceneError, match="must have at least one Gaussian, found none"):
+        find_count(random_scene(2)[:0], psnr=30.0, heldout=views)
 
 
 @pytest.mark.parametrize("wanted", [3.0, 17.0, 25.0, 31.4, 44.0])

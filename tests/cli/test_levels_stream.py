@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from cvtgs import load, save, synthetic
 from cvtgs.cli.main import main
@@ -214,3 +215,33 @@ def test_turned_scenes_are_not_scored_from_cameras_beside_them(
     (tmp_path / "cameras.json").write_text(json.dumps(entries))
     assert main([*words, "--rho", "0.1", *axes]) == 0
     assert ("cameras found in" in capsys.readouterr().err) == (not axes)
+
+
+@pytest.mark.slow
+def test_levels_without_bands_are_scored_against_the_whole_scene(tmp_path, capsys):
+    save(synthetic.scene("object", 300, sh_degree=2), tmp_path / "a.ply")
+    words = ["levels", str(tmp_path / "a.ply"), "-o", str(tmp_path), "--rho", "1", "--views", "1"]
+    assert main([*words, "--size", "64", "--sh-degree", "0"]) == 0
+    (level,) = json.loads((tmp_path / "levels.json").read_text())["levels"]
+    assert load(tmp_path / level["file"]).sh_degree == 0
+    assert 10 < level["psnr"] < 60
+
+
+@pytest.mark.parametrize("words", [["--size", "1"], ["--backend", "gsplat", "--device", "cpu"]])
+def test_levels_that_cannot_be_scored_are_not_made(tmp_path, capsys, words):
+    save(random_scene(30), tmp_path / "a.ply")
+    line = ["levels", str(tmp_path / "a.ply"), "-o", str(tmp_path / "out"), "--rho", "0.5"]
+    assert main([*line, *words]) == 1
+    assert list((tmp_path / "out").glob("*")) == []
+
+
+def test_levels_of_fewer_gaussians_than_asked_for_say_why(tmp_path, capsys):
+    scene = random_scene(20)
+    means = scene.means.clone()
+    means[:5] = torch.nan
+    save(scene.with_tensors({"means": means}, {}), tmp_path / "a.ply")
+    line = ["levels", str(tmp_path / "a.ply"), "-o", str(tmp_path), "--rho", "0.9", "--no-scores"]
+    assert main([*line, "--preset", "draft"]) == 0
+    printed = capsys.readouterr().out
+    assert "Fewer than the requested 18: only 15 of 20 Gaussians are valid." in printed
+    assert "of an earlier run" not in printed

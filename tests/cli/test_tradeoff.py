@@ -76,6 +76,23 @@ def test_invalid_arguments_are_refused_in_one_sentence(source, tmp_path, capsys,
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    "words",
+    [["--size", "1"], ["--backend", "gsplat", "--device", "cpu"], ["--cameras", "far.json"]],
+)
+def test_what_cannot_be_scored_is_found_before_the_runs(source, tmp_path, monkeypatch, words):
+    def started(*_, **__):
+        raise AssertionError("a run was started")
+
+    monkeypatch.setattr("cvtgs.tradeoff.measure.run_process", started)
+    monkeypatch.chdir(tmp_path)
+    pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -1e6], [0, 0, 0, 1]]
+    frames = [{"file_path": "0.png", "transform_matrix": pose}]
+    Path("far.json").write_text(json.dumps({"w": 48, "h": 36, "fl_x": 40.0, "frames": frames}))
+    line = ["tradeoff", str(source), "-o", "out", "--rho", "0.1", "--presets", "draft"]
+    assert main([*line, "--lpips", "off", *words]) == 1
+
+
 def test_a_missing_scene_is_found_before_the_runs(tmp_path, capsys):
     assert main(["tradeoff", str(tmp_path / "no.ply"), "-o", str(tmp_path / "out")]) == 1
     assert "no.ply: " in capsys.readouterr().err

@@ -49,6 +49,18 @@ def test_a_scene_is_not_replaced_through_a_link_to_its_folder(
     check_results(file, tmp_path, [TASK])
 
 
+def test_arguments_of_another_kind_are_named(tmp_path: Path, scene: GaussianScene) -> None:
+    cvtgs.save(scene, tmp_path / "in.ply")
+    for changes, text in (
+        ({"cameras": look(scene)}, "cameras must be a function that returns the views"),
+        ({"listener": None}, "listener must be"),
+        ({"presets": "draft"}, "presets must be a list of names, found 'draft'"),
+        ({"presets": 3}, "presets must be a list of names, found 3"),
+    ):
+        with pytest.raises(InvalidArgumentError, match=text):
+            measure_tradeoff(tmp_path / "in.ply", **({"presets": ["draft"]} | changes))
+
+
 @pytest.mark.slow
 def test_names_may_begin_with_a_dash(tmp_path, scene, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -34,14 +34,8 @@ from cvtgs.tradeoff.files import (
     ticks,
     tradeoff_chart,
 )
-from cvtgs.tradeoff.measure import (
-    WARNING,
-    ProcessCost,
-    Run,
-    pass_warnings_on,
-    run_process,
-    tasks_of,
-)
+from cvtgs.tradeoff.measure import Run, tasks_of
+from cvtgs.tradeoff.process_cost import WARNING, ProcessCost, pass_warnings_on, run_process
 from cvtgs.tradeoff.results import on_front, with_fronts
 from cvtgs.views import automatic_views
 from tradeoff_cases import result

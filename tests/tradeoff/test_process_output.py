@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from cvtgs.errors import RunError
-from cvtgs.tradeoff.measure import START, run_process
+from cvtgs.tradeoff.process_cost import START, run_process
 
 
 def test_the_output_of_a_process_on_windows_is_read(monkeypatch):

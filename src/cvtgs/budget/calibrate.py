@@ -18,12 +18,12 @@ import torch
 
 import cvtgs
 from cvtgs.budget.costs import FEATURES, CostModel, Measurement, Work
-from cvtgs.clock import StageCost
+from cvtgs.clock import StageCost, check_listener
 from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.counts import target_count
 from cvtgs.devices import chosen_device, device_name
-from cvtgs.errors import OutputError
+from cvtgs.errors import OutputError, warn
 from cvtgs.io.atomic import write_atomically
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.scene import GaussianScene
@@ -119,6 +119,10 @@ Of fewer than eight images, matching would hold out all instead of every eighth.
 """
 
 
+_UNSAVED: dict[Path, "CachedModel"] = {}
+"""Measurements of this process that could not be written, by the file they belong in."""
+
+
 class CachedModel(Record, allow_inf_nan=False):
     """The content of the cache file."""
 
@@ -140,7 +144,8 @@ def cost_model(
 
     It is measured again if the machine, the device, the number of threads, the versions of Python,
     torch or cvtgs, the installed renderers or the presets change, after 90 days, and if the cache
-    file is damaged. If the file cannot be written, the result is not cached.
+    file is damaged. If the file cannot be written, a warning says so, and
+    this process keeps the result.
 
     Args:
         device: Device that the presets run on.
@@ -163,6 +168,7 @@ def cost_model(
         >>> list(model.rates)
         ['check']
     """
+    check_listener(listener)
     where = chosen_device(device)
     key = machine_key(where)
     path = _cache_path(key, folder)
@@ -174,8 +180,9 @@ def cost_model(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, record.to_json().encode(), overwrite=True)
-    except (OSError, OutputError):
-        pass  # the next process measures again
+    except (OSError, OutputError) as error:
+        _UNSAVED[path] = record
+        warn(f"the measurement of this machine is not saved, the next process repeats it: {error}")
     return model
 
 
@@ -220,9 +227,9 @@ def machine_key(device: torch.device) -> dict[str, str]:
 
 def cache_folder() -> Path:
     """Return the folder of cvtgs in the user's cache."""
-    named = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
-    if named:
-        return Path(named) / "cvtgs"
+    named = Path(os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or ".")
+    if named.is_absolute():  # others are invalid (XDG Base Directory Specification)
+        return named / "cvtgs"
     home = Path(os.path.expanduser("~"))  # noqa: PTH111 (Path.home() fails where there is none)
     return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "cvtgs"
 
@@ -238,7 +245,7 @@ def _digest(value: object) -> str:
 def _read_cached(path: Path, key: Mapping[str, str]) -> CostModel | None:
     """Read the cached model; None if it is missing, damaged, stale or made for another key."""
     try:
-        record = CachedModel.model_validate_json(path.read_bytes())
+        record = _UNSAVED.get(path) or CachedModel.model_validate_json(path.read_bytes())
     except (OSError, ValueError):
         return None
     fresh = 0 <= time.time() - record.made < STALE_SECONDS

@@ -14,7 +14,7 @@ from cvtgs.checks import checked
 from cvtgs.clock import check_listener
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import real_number, target_count
-from cvtgs.errors import GoalError, InvalidArgumentError
+from cvtgs.errors import GoalError, InvalidArgumentError, InvalidSceneError
 from cvtgs.evaluation.scorer import MOST_PSNR, Metrics, Scorer, check_seen, scene_scores
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import Simplified, SimplifyReport
@@ -91,9 +91,16 @@ class Target(NamedTuple):
         """Return the score of the metric."""
         return tried.psnr if self.metric == "psnr" else tried.ssim
 
-    def text(self, value: float) -> str:
-        """Format a value of the metric."""
-        return f"{value:.2f} dB" if self.metric == "psnr" else f"SSIM {value:.4f}"
+    def text(self, value: float, digits: int = 0) -> str:
+        """Format a value of the metric, with some more digits than usual."""
+        if self.metric == "psnr":
+            return f"{value:.{2 + digits}f} dB"
+        return f"SSIM {value:.{4 + digits}f}"
+
+    def missed(self, value: float) -> tuple[str, str]:
+        """Format this quality and a lower one, with as many digits as tell them apart."""
+        texts = ((self.text(self.value, more), self.text(value, more)) for more in range(9))
+        return next((pair for pair in texts if pair[0] != pair[1]), (self.text(self.value),) * 2)
 
 
 def checked_target(psnr: float | None, *, ssim: float | None) -> Target:
@@ -169,6 +176,8 @@ def find_count(
     simplifier = simplifier or Simplifier()
     prepared = simplifier.prepare(scene, cameras=cameras)
     total, full = len(prepared.scene), prepared.scene
+    if total == 0:
+        raise InvalidSceneError("the scene must have at least one Gaussian, found none.")
     if heldout is None:
         seed = HELDOUT_SEED if simplifier.config.uses_images else 0
         heldout = automatic_views(full, VIEWS, width=WIDTH, height=HEIGHT, seed=seed)
@@ -195,10 +204,10 @@ def find_count(
     listener(ProgressEvent(stage=STAGE, done=MOST_TRIES, total=MOST_TRIES))
     if best is None:
         nearest = max(tried, key=target.of)
+        wanted, reached = target.missed(target.of(nearest))
         raise GoalError(
-            f"no simplified scene reaches {target.text(target.value)}: the best one tried, with "
-            f"{nearest.count:,} of {total:,} Gaussians, reaches "
-            f"{target.text(target.of(nearest))}."
+            f"no simplified scene reaches {wanted}: the best one tried, with {nearest.count:,} of "
+            f"{total:,} Gaussians, reaches {reached}."
         )
     (small, report), quality = best
     return Found(
@@ -272,6 +281,10 @@ def smallest_enough(
             share = min(max(share, _SHORTEST), 1 - _SHORTEST)
             count = round(math.exp(start + share * (end - start)))
             count = min(max(count, low + 1), high - 1)
+
+
+def _rounded(seconds: float) -> str:
+    return f"{seconds:.2g}" if seconds < 10 else f"{seconds:,.0f}"
 
 
 MARGIN = 1.3
@@ -352,9 +365,9 @@ def choose_preset(
     if not fitting:
         fastest = min(costs, key=lambda name: costs[name])
         raise GoalError(
-            f"no preset fits into {seconds:.2g} s: the fastest, {fastest}, takes about "
-            f"{costs[fastest]:.2g} s to make {work.target:,} of {work.count:,} Gaussians, and "
-            f"{MARGIN:g} times that is reserved."
+            f"no preset fits into {_rounded(seconds)} s: the fastest, {fastest}, takes about "
+            f"{_rounded(costs[fastest])} s to make {work.target:,} of {work.count:,} Gaussians, "
+            f"and {MARGIN:g} times that is reserved."
         )
     best = fitting[-1]
     return Choice(best, costs[best])

@@ -114,6 +114,11 @@ def target_note(found: "Found", config: "SimplifyConfig", *, is_given: bool) -> 
     )
 
 
+def shortfall_note(report: "SimplifyReport") -> str:
+    """Return why a result is smaller than asked for."""
+    return f"Fewer than the requested {report.target_count:,}: {report.shortfall}."
+
+
 def report_notes(report: "SimplifyReport") -> list[str]:
     """Return the sentences to print besides counts, sizes and seconds."""
     notes = []
@@ -127,7 +132,7 @@ def report_notes(report: "SimplifyReport") -> list[str]:
         )
         notes.append(f"In {report.blocks} blocks{resumed}.")
     if report.shortfall:
-        notes.append(f"Fewer than the requested {report.target_count:,}: {report.shortfall}.")
+        notes.append(shortfall_note(report))
     if report.matching is not None:
         from cvtgs.matching import heldout_rows
 

@@ -16,7 +16,7 @@ from cvtgs.cli.cameras import (
     evaluation_settings,
     read_photographs,
 )
-from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped
+from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped, shortfall_note
 from cvtgs.cli.jobs import expanded
 from cvtgs.cli.options import CAMERA_FILES, AddParser, add_options, read_words
 from cvtgs.cli.view import PAGE, check_page, write_page
@@ -327,5 +327,8 @@ def _print_tradeoff(tradeoff: "Tradeoff") -> None:
         say(heading(tradeoff, rho))
         runs = [cells(tradeoff, result) for result in tradeoff.results if result.rho == rho]
         say_table([[name, *(run[name] for run in runs)] for name in runs[0]])
+        fewer = [one.report for one in tradeoff.results if one.rho == rho and one.report.shortfall]
+        if fewer:
+            say(shortfall_note(fewer[0]))
     say(MARK_MEANS)
     say_wrapped(how_measured(tradeoff))

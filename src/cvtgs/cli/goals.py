@@ -15,6 +15,7 @@ from cvtgs.errors import DroppedDataWarning, GoalError, InvalidArgumentError, wi
 if TYPE_CHECKING:
     from cvtgs.budget import Found
     from cvtgs.cameras import Cameras
+    from cvtgs.config import SimplifyConfig
     from cvtgs.progress import ProgressListener
     from cvtgs.scene import GaussianScene
     from cvtgs.simplifier import Simplifier
@@ -23,17 +24,24 @@ STARTED = time.perf_counter()  # approximate start of this process, from which a
 
 
 class ChosenPreset(NamedTuple):
-    """A preset, the sentence that explains the choice, and the time that is left for the run."""
+    """A preset, why it was chosen, the time that is left for the run, and what to do if it is not.
+
+    Attributes:
+        name: Name of the preset.
+        reason: The sentence that explains the choice.
+        left: Seconds that are left for the run.
+        advice: What to do if the run takes longer.
+    """
 
     name: str
     reason: str
     left: float
+    advice: str
 
     def late_note(self, seconds: float) -> list[str]:
         """Return a sentence if a run took longer than the time that was left."""
         took = f"The run took {seconds:.1f} s, where {self.left:.1f} s were left"
-        advice = "--recalibrate measures this machine again"
-        return [f"{took}; {advice}."] if seconds > self.left else []
+        return [f"{took}; {self.advice}."] if seconds > self.left else []
 
 
 def has_target(options: argparse.Namespace) -> bool:
@@ -65,6 +73,15 @@ def check_goals(options: argparse.Namespace) -> None:
         raise InvalidArgumentError(
             f"--time-budget chooses the preset and cannot be used with {', '.join(wrong)}."
         )
+
+
+def with_limited_bands(config: "SimplifyConfig", degree: int | None) -> "SimplifyConfig":
+    """Return a configuration that drops the SH bands above a degree."""
+    own = config.effects.sh
+    if degree is None or own == "off" or (isinstance(own, int) and own <= degree):
+        return config
+    effects = config.effects.model_copy(update={"sh": degree})
+    return config.model_copy(update={"effects": effects})
 
 
 def choose_preset(
@@ -107,7 +124,10 @@ def choose_preset(
         f"Preset {choice.preset}, the best that fits into {budget:g} s: expected to take "
         f"{choice.seconds:.1f} s after {spent:.1f} s of starting and reading."
     )
-    return ChosenPreset(choice.preset, reason, budget - spent)
+    advice = "--recalibrate measures this machine again"
+    if options.shipped_rates:
+        advice = "without --shipped-rates, this machine is measured"
+    return ChosenPreset(choice.preset, reason, budget - spent, advice)
 
 
 def search_target(

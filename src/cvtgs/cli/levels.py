@@ -11,7 +11,7 @@ from cvtgs.cli.cameras import (
     choose_cameras,
     evaluation_settings,
 )
-from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped
+from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped, shortfall_note
 from cvtgs.cli.jobs import check_suffix
 from cvtgs.cli.options import (
     AddParser,
@@ -106,12 +106,10 @@ def levels(options: argparse.Namespace) -> None:
             checkpoint, config=config, device=options.device, listener=listener
         )
         scene = cvtgs.load(options.input, axes=axes.source, trust_sizes=options.trust_sizes)
-        if options.sh_degree is not None:
-            scene = scene.with_sh_degree(options.sh_degree)
+        degree = scene.sh_degree if options.sh_degree is None else options.sh_degree
         cameras = _cameras_to_fit(options, scene) if config.uses_images else None
-        if is_scored and options.cameras is not None:
-            _check_seen(options, scene)
-        made = simplifier.levels(scene, rhos, cameras=cameras)
+        views = _checked_views(options, scene) if is_scored else None
+        made = simplifier.levels(scene.with_sh_degree(degree), rhos, cameras=cameras)
         if options.stream is not None:
             stream_levels(options, made, axes, listener)
             return
@@ -124,21 +122,25 @@ def levels(options: argparse.Namespace) -> None:
             axes=axes.target,
             overwrite=options.overwrite,
         )
-        if is_scored:
+        if views is not None:
             files = {
                 name: cvtgs.load(options.output / name, axes=axes.target, trust_sizes=True)
                 for name in names
             }
-            evaluation = _score(options, scene, files, listener)
+            evaluation = _score(options, scene, files, views, listener)
             index = cvtgs.levels.add_scores(index, options.output, evaluation)
     if not options.quiet:
         _print_index(index)
+        for level in made:
+            if level.report.shortfall:
+                say(shortfall_note(level.report))
         if is_scored and cameras is not None and options.split is None:
             say_wrapped(
                 "Levels were fitted to cameras of which some score, which favours them; with "
                 "--cameras and --split test, others do."
             )
         older = {path.name for path in options.output.glob("rho_*")} - set(names)
+        older -= {options.input.name}
         if older:
             listed = ", ".join(map(printable, sorted(older)))
             say_wrapped(f"Not in {cvtgs.levels.INDEX_NAME}, of an earlier run: {listed}.")
@@ -168,18 +170,21 @@ def _cameras_to_fit(options: argparse.Namespace, scene: "GaussianScene") -> "Cam
     return None if own is None else own.cameras
 
 
-def _check_seen(options: argparse.Namespace, scene: "GaussianScene") -> None:
-    """Raise before the long work if the cameras that are to score see nothing."""
-    from cvtgs.evaluation.scorer import check_seen
+def _checked_views(options: argparse.Namespace, scene: "GaussianScene") -> "Cameras":
+    """Return the views that score; raise before the long work if the levels cannot be scored."""
+    from cvtgs.evaluation.compare import check_scores
 
     full = cvtgs.validity.valid_part(scene)
-    check_seen(full, choose_cameras(options, full), name=options.input.name)
+    views = choose_cameras(options, full)
+    check_scores(full, views, settings=evaluation_settings(options), name=options.input.name)
+    return views
 
 
 def _score(
     options: argparse.Namespace,
     scene: "GaussianScene",
     levels: "Mapping[str, GaussianScene]",
+    views: "Cameras",
     listener: "ProgressListener",
 ) -> "Evaluation":
     from cvtgs.devices import chosen_device
@@ -189,7 +194,7 @@ def _score(
     return cvtgs.evaluate(
         full,
         {name: level.to(device) for name, level in levels.items()},
-        choose_cameras(options, full),
+        views,
         settings=evaluation_settings(options),
         listener=listener,
     )

@@ -352,14 +352,15 @@ def preset_of(options: argparse.Namespace) -> str | None:
 
 
 def read_scene(
-    options: argparse.Namespace, config: "SimplifyConfig", *, axes: str | None = None
-) -> "GaussianScene":
-    """Read the scene ``IN`` without the columns that ``--effects`` and ``--sh-degree`` exclude."""
-    kept = getattr(options, "sh_degree", None)
+    options: argparse.Namespace, config: "SimplifyConfig", *, axes: str | None = None,
+    all_bands: bool = False,
+) -> "GaussianScene":  # fmt: skip
+    """Read ``IN`` without what ``--effects`` and ``--sh-degree`` exclude, or with all bands."""
+    kept = None if all_bands else getattr(options, "sh_degree", None)
     limits = [limit for limit in (config.effects.sh, kept) if isinstance(limit, int)]
     scene = cvtgs.io.load(
         options.input,
-        sh_degree=min(limits, default=None),
+        sh_degree=None if all_bands else min(limits, default=None),
         extras=config.effects.extras != "off",
         axes=axes,
         trust_sizes=options.trust_sizes,

@@ -11,7 +11,14 @@ import cvtgs
 from cvtgs.cli.blocks import add_block_options, block_workers, check_block_device, memory_of
 from cvtgs.cli.cameras import check_split, read_cameras
 from cvtgs.cli.display import TIE, progress_bars, report_notes, target_note
-from cvtgs.cli.goals import STARTED, check_goals, choose_preset, has_target, search_target
+from cvtgs.cli.goals import (
+    STARTED,
+    check_goals,
+    choose_preset,
+    has_target,
+    search_target,
+    with_limited_bands,
+)
 from cvtgs.cli.jobs import Outcome, SceneJob, add_paths, check_paths, open_jobs, run_jobs
 from cvtgs.cli.options import (
     CAMERA_FILES,
@@ -95,8 +102,9 @@ def add_simplify(add_parser: AddParser) -> None:
         "--time-budget",
         type=seconds,
         metavar="TIME",
-        help="use the best preset that is predicted to take at most this time, for example 20s or "
-        "2m; the first use measures this machine, which takes about 10 seconds and does not count",
+        help="use the best preset that is predicted to take at most this time for a scene, for "
+        "example 20s or 2m; the first use measures this machine, which takes about 10 seconds and "
+        "does not count",
     )
     rates = parser.add_mutually_exclusive_group()
     rates.add_argument(
@@ -223,7 +231,10 @@ def _simplify_in_memory(
 
     notes = []
     axes = read_axes(options.axes)
-    scene = read_scene(options, config, axes=axes.source)
+    search = has_target(options)  # results are scored against all of IN
+    scene = read_scene(options, config, axes=axes.source, all_bands=search)
+    if search:
+        config = with_limited_bands(config, options.sh_degree)
     cameras, chosen = read_cameras(options), None
     if options.time_budget is not None:
         chosen = choose_preset(options, scene, settings, listener)
@@ -236,7 +247,6 @@ def _simplify_in_memory(
             notes.append(
                 f"Rendered from {counted(len(cameras), 'camera')} found in {own.source.resolve()}."
             )
-    search = has_target(options)
     simplifier = cvtgs.Simplifier(
         checkpoint, config=config, device=options.device, listener=silent if search else listener
     )
@@ -245,6 +255,8 @@ def _simplify_in_memory(
             options, scene, simplifier, cameras=cameras, axes=axes.target, listener=listener
         )
         small, report = found.scene, found.report
+        if isinstance(config.effects.sh, int):
+            small = small.with_sh_degree(config.effects.sh)
         notes.append(target_note(found, config, is_given=options.cameras is not None))
     else:
         keep = None

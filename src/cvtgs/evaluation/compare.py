@@ -19,6 +19,7 @@ from cvtgs.evaluation.scorer import (
     Evaluation,
     EvaluationSettings,
     ImageScores,
+    Metrics,
     SceneScores,
     check_seen,
     chosen_metrics,
@@ -248,6 +249,41 @@ def _check_photographs(photographs: Float[Tensor, "c h w 3"], cameras: Cameras) 
 
 
 @torch.no_grad()
+def check_scores(
+    scene: GaussianScene,
+    cameras: Cameras,
+    *,
+    photographs: Float[Tensor, "c h w 3"] | None = None,
+    settings: EvaluationSettings,
+    name: str,
+) -> None:
+    """Raise, before long work, what :func:`evaluate` would raise after it."""
+    metrics = _checked_metrics(scene, cameras, photographs, settings, name=name)
+    image = render_views(scene[:1], next(iter(cameras.singles())), backend=settings.backend)
+    color = image.over(scene.means.new_tensor(settings.background)).clamp(0, 1)
+    metrics.compare(color, color)
+
+
+def _checked_metrics(
+    reference: GaussianScene,
+    cameras: Cameras,
+    photographs: Float[Tensor, "c h w 3"] | None,
+    settings: EvaluationSettings,
+    *,
+    name: str,
+) -> Metrics:
+    """Check the arguments of an evaluation, and return its metrics."""
+    if len(checked_cameras(cameras)) == 0:
+        raise InvalidArgumentError("an evaluation needs at least one camera, found none.")
+    check_kinds({"settings": EvaluationSettings}, {"settings": settings})
+    if photographs is not None:
+        _check_photographs(photographs, cameras)
+    metrics = chosen_metrics(settings.lpips, (cameras.width, cameras.height))
+    check_seen(reference, cameras, name=name, backend=settings.backend)
+    return metrics
+
+
+@torch.no_grad()
 def _score_images(
     scenes: Mapping[str, GaussianScene],
     cameras: Cameras,
@@ -258,18 +294,12 @@ def _score_images(
     listener: ProgressListener,
 ) -> Evaluation:
     """Score all scenes against the first, view by view; pass every image to ``keep``."""
-    if len(checked_cameras(cameras)) == 0:
-        raise InvalidArgumentError("an evaluation needs at least one camera, found none.")
-    check_kinds({"settings": EvaluationSettings}, {"settings": settings})
     check_listener(listener)
-    if photographs is not None:
-        _check_photographs(photographs, cameras)
-    metrics = chosen_metrics(settings.lpips, (cameras.width, cameras.height))
     (reference_name, reference), *_ = scenes.items()
+    metrics = _checked_metrics(reference, cameras, photographs, settings, name=reference_name)
     against_full: dict[str, list[ImageScores]] = {name: [] for name in scenes}
     against_photographs: dict[str, list[ImageScores]] = {name: [] for name in scenes}
     total, done = len(cameras) * len(scenes), 0
-    check_seen(reference, cameras, name=reference_name, backend=settings.backend)
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
     for view, camera in enumerate(cameras.singles()):
         truth: tuple[Tensor, Tensor] | None = None

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from cvtgs.counts import written
 from cvtgs.errors import MissingDependencyError
 from cvtgs.evaluation.comparison_files import PAGE, comparison_page, render_template
 from cvtgs.io import check_output
@@ -139,7 +140,7 @@ def tradeoff_chart(tradeoff: Tradeoff) -> bytes:
             results.sort(key=lambda result: result.seconds)
             series.append(
                 Series(
-                    name=f"rho {rho:g}",
+                    name=f"rho {written(rho)}",
                     x=[max(result.seconds, 1e-3) for result in results],
                     y=[result.psnr if metric == "psnr" else result.ssim for result in results],
                     markers=True,
@@ -219,7 +220,7 @@ def cells(tradeoff: Tradeoff, result: TradeoffResult) -> Mapping[str, str]:
 def heading(tradeoff: Tradeoff, rho: float) -> str:
     """Return the table heading of a ratio."""
     count = max(result.count for result in tradeoff.results if result.rho == rho)
-    return f"rho {rho:g}: {count:,} of {counted(tradeoff.source_count, 'Gaussian')}"
+    return f"rho {written(rho)}: {count:,} of {counted(tradeoff.source_count, 'Gaussian')}"
 
 
 def how_measured(tradeoff: Tradeoff) -> str:

@@ -2,7 +2,6 @@
 
 import os
 import platform
-import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -16,54 +15,24 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
+from cvtgs.clock import check_listener
 from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.config.simplify import unknown_preset
 from cvtgs.counts import written_ratios
 from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import InvalidArgumentError, RunError, warn
 from cvtgs.evaluation import Comparison, EvaluationSettings, compare
+from cvtgs.evaluation.compare import check_scores
 from cvtgs.evaluation.scorer import mean_of
 from cvtgs.io import load, load_cameras, scene_file, scene_size
+from cvtgs.io.atomic import make_folder
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import SimplifyReport
 from cvtgs.scene import GaussianScene
-from cvtgs.text import counted, printable_name
+from cvtgs.text import counted, printable_name, shown
+from cvtgs.tradeoff.process_cost import ProcessCost, pass_warnings_on, run_process, start_seconds
 from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult, with_fronts
 from cvtgs.views import automatic_views, find_own_cameras
-
-WARNING = "cvtgs: warning: "
-
-START = """
-import gc, cvtgs.cli.main, cvtgs.startup
-cvtgs.startup.load_torch()
-import cvtgs.config, cvtgs.io, cvtgs.mergenet, cvtgs.simplifier
-gc.freeze()
-"""
-"""What every process does besides work on a scene: it loads modules as the command line does."""
-
-# A process inherits the peak memory of its parent, so this small launcher starts the command. On an
-# interrupt, which the child receives too, it keeps waiting for the child. When its own parent ends
-# or closes the pipe, for whatever reason, it terminates the child.
-LAUNCHER = """
-import os, signal, subprocess, sys, threading, time
-signal.signal(signal.SIGINT, lambda *_: None)
-start = time.perf_counter()
-process = subprocess.Popen(sys.argv[1:], stdin=subprocess.DEVNULL)
-def end():
-    os.read(0, 1)
-    process.terminate()
-threading.Thread(target=end, daemon=True).start()
-signal.signal(signal.SIGTERM, lambda *_: process.terminate())
-code = process.wait()
-wall = time.perf_counter() - start
-try:
-    import resource
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    user, peak = usage.ru_utime, usage.ru_maxrss
-except ImportError:
-    user = peak = 0
-sys.stdout.write(f"\\n{code} {user} {wall} {peak}\\n")
-"""
 
 STAGE = "simplify"
 RATIOS = (0.1, 0.01, 0.001)
@@ -72,17 +41,6 @@ CameraChoice = Callable[[GaussianScene], Cameras]  # function that returns the v
 
 PhotographChoice = Callable[[Cameras], Float[Tensor, "c h w 3"]]
 """Function that returns the photograph of every camera, at the size of the cameras."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ProcessCost:
-    """The cost of one process, its stdout and its stderr; Windows reports no peak memory: 0."""
-
-    wall_seconds: float
-    user_seconds: float
-    peak_memory_bytes: int
-    output: str
-    errors: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,7 +78,9 @@ class Run:
 
 def tasks_of(presets: Sequence[str] | None, ratios: Sequence[float]) -> tuple[Task, ...]:
     """Check presets and ratios, and list the runs, ratio by ratio."""
-    names = list(PRESETS) if presets is None else list(presets)
+    if isinstance(presets, str) or not isinstance(presets, Sequence | None):
+        raise InvalidArgumentError(f"presets must be a list of names, found {shown(presets)}.")
+    names = list(PRESETS if presets is None else presets)
     for name in names:
         if name not in PRESETS:
             raise unknown_preset(name)
@@ -176,69 +136,6 @@ def run_task(
     return Run(task=task, path=path, cost=cost, report=found)
 
 
-def start_seconds() -> float:
-    """Measure the seconds that a process takes before it reads a scene; the first may be cold."""
-    return min(run_process([sys.executable, "-c", START]).wall_seconds for _ in range(2))
-
-
-def pass_warnings_on(errors: str, warned: set[str]) -> None:
-    """Repeat the warnings of a process, except those in ``warned``, which is updated."""
-    for line in errors.splitlines():
-        if line.startswith(WARNING) and line not in warned:
-            warned.add(line)
-            warn(line.removeprefix(WARNING))
-
-
-def run_process(command: Sequence[str]) -> ProcessCost:
-    r"""Run a command to its end and measure it.
-
-    If this call is interrupted, the process is terminated first. Lines of its output end with
-    ``\n``, and Python writes it as UTF-8, on Windows too.
-    """
-    launcher = [sys.executable, "-S", "-c", LAUNCHER, *command]
-    reading, writing = os.pipe()
-    with os.fdopen(writing, "wb") as held:
-        with os.fdopen(reading, "rb") as watched:
-            process = subprocess.Popen(
-                launcher,
-                stdin=watched,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                env={**os.environ, "PYTHONIOENCODING": "utf-8"},
-            )
-        with process:
-            try:
-                written = process.communicate()
-            except BaseException:
-                held.close()
-                process.communicate()
-                raise
-    texts = (part.decode(errors="replace") for part in written)
-    output, errors = (text.replace("\r\n", "\n") for text in texts)
-    output, _, line = output.rstrip("\n").rpartition("\n")
-    try:
-        code, user, wall, peak = (float(word) for word in line.split())
-    except ValueError:
-        raise RunError(f"{command[0]} could not be started: {_last_line(errors)}.") from None
-    if code < 0:
-        raise RunError(f"it was ended by signal {-code:.0f}; 9 often means that memory ran out.")
-    if code:
-        raise RunError(_last_line(errors) or f"it ended with exit code {code:.0f}.")
-    unit = 1 if sys.platform == "darwin" else 1024
-    return ProcessCost(
-        wall_seconds=wall,
-        user_seconds=user,
-        peak_memory_bytes=int(peak) * unit,
-        output=output,
-        errors=errors,
-    )
-
-
-def _last_line(errors: str) -> str:
-    lines = [line for line in errors.splitlines() if line.strip()]
-    return lines[-1].removeprefix("cvtgs: error: ") if lines else ""
-
-
 def _shared(views: Cameras, training: Path) -> int:
     """Return how many of some views are of training cameras."""
     cameras = load_cameras(training, split="train")
@@ -266,7 +163,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
     cameras: CameraChoice = automatic_views,
     photographs: PhotographChoice | None = None,
     settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
-    device: str = "auto",
+    device: str | torch.device = "auto",
     folder: str | os.PathLike[str] | None = None,
     trust_sizes: bool = False,
     listener: ProgressListener = silent,
@@ -291,9 +188,9 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         cameras: Returns the views of the scene.
         photographs: Returns their photographs, to score all scenes against too; None for none.
         settings: Background, LPIPS network and backend.
-        device: ``auto``, ``cpu`` or ``cuda``.
-        folder: Folder to keep the results in, as ``fast_0.01.ply``; files of the same name are
-            replaced. None keeps no results.
+        device: Any torch device, or ``auto``.
+        folder: Folder to keep the results in, made if it is missing, as ``fast_0.01.ply``; files
+            of the same name are replaced. None keeps no results.
         trust_sizes: Whether to believe a compressed source that claims far more Gaussians than its
             bytes can hold.
         listener: Called after each run and image.
@@ -319,11 +216,20 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         [('standard 0.1', 50)]
     """
     tasks = tasks_of(presets, ratios)
-    if folder is not None:
-        check_results(source, Path(folder), tasks)
+    check_listener(listener)
+    if not callable(cameras):
+        raise InvalidArgumentError(
+            f"cameras must be a function that returns the views of a scene, found {shown(cameras)}."
+        )
     where = chosen_device(device)
-    full = load(source, trust_sizes=trust_sizes).to(where)
+    if folder is not None:
+        make_folder(folder)
+        check_results(source, Path(folder), tasks)
+    full, source_name = load(source, trust_sizes=trust_sizes), printable_name(Path(source).name)
+    full = full.to(where)
     views, own = cameras(full), find_own_cameras(full, source)
+    truths = None if photographs is None else photographs(views)
+    check_scores(full, views, photographs=truths, settings=settings, name=source_name)
     training = own.source if own is not None and own.test_cameras() is not None else None
     shared = 0 if training is None else _shared(views, training)
     if shared and any(task.uses_images for task in tasks):
@@ -340,7 +246,12 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
             listener(ProgressEvent(stage=STAGE, done=done, total=len(tasks), note=task.name))
             try:
                 run = run_task(
-                    source, task, place, training=training, device=device, trust_sizes=trust_sizes
+                    source,
+                    task,
+                    place,
+                    training=training,
+                    device=str(device),
+                    trust_sizes=trust_sizes,
                 )
             except RunError as error:
                 failures.append(Failure(name=task.name, reason=str(error)))
@@ -353,14 +264,13 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         for failure in failures:
             warn(f"{failure.name} failed: {failure.reason}")
         sizes = {run.task.name: run.path.stat().st_size for run in runs}
-        source_name = printable_name(Path(source).name)
         comparison = compare(
             full,
             {run.task.name: load(run.path).to(where) for run in runs},
             views,
             reference_name=source_name,
             sizes=sizes | {source_name: scene_size(source)},
-            photographs=None if photographs is None else photographs(views),
+            photographs=truths,
             settings=settings,
             listener=listener,
         )
