@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from cvtgs import synthetic
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import InvalidArgumentError, OutOfMemoryError
 from cvtgs.math import parameters
 from cvtgs.synthetic import gaussians, surfaces, textures
 from cvtgs.synthetic.scenes import allocate
@@ -202,6 +202,15 @@ def test_bad_arguments_are_refused(arguments, text):
     valid = {"kind": "room", "count": 10, "sh_degree": 0, "seed": 0}
     with pytest.raises(InvalidArgumentError, match=text):
         synthetic.scene(**{**valid, **arguments})
+
+
+def test_scenes_that_need_too_much_memory_are_one_clear_error(monkeypatch):
+    def full(*_):
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory")
+
+    monkeypatch.setattr("cvtgs.synthetic.scenes._draw_parts", full)
+    with pytest.raises(OutOfMemoryError, match="a scene of 5,000 Gaussians needs more memory"):
+        synthetic.scene("object", 5000)
 
 
 def test_autocast_does_not_change_scenes():

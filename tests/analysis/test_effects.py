@@ -22,6 +22,7 @@ from cvtgs.analysis.effects import (
     haze_share,
     select_columns,
 )
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.spherical_harmonics import REST_COUNTS, evaluate
 from cvtgs.tags import ANTIALIASED
@@ -364,3 +365,9 @@ def test_what_is_never_drawn_is_no_haze():
     opacities = torch.tensor([0.001, least, 0.9])
     found = haze_share(opacities, torch.tensor([10.0, 1.0, 3.0]), config)
     assert float(found) == pytest.approx(1 / (1 + 3))
+
+
+def test_masses_of_other_gaussians_are_refused():
+    scene = random_scene(5)
+    with pytest.raises(InvalidArgumentError, match=r"distances must be .* of shape \(5,\), found"):
+        plan_effects(scene, scene.masses, distances=torch.ones(4))

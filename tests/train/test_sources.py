@@ -66,6 +66,13 @@ def test_scenes_may_be_named_with_their_suffix(tmp_path):
     assert names_of(sources, is_validation=True) == ["exam"]
 
 
+def test_a_scene_that_is_for_validation_and_training_is_mentioned(tmp_path):
+    write_scenes(tmp_path, ["a", "exam"], 50)
+    (tmp_path / "b.ply").write_bytes((tmp_path / "exam.ply").read_bytes())
+    with pytest.warns(UserWarning, match=r"exam\.ply is for validation, but b of the same content"):
+        find_sources(tiny_data(tmp_path), seed=0)
+
+
 def test_scenes_of_the_same_name_are_one_clear_error(tmp_path):
     """So are a file that is named like a copy, and a folder that is given twice."""
     first = write_scenes(tmp_path / "one", ["a", "a-copy0", "exam"], 50)
@@ -96,7 +103,8 @@ def test_hidden_files_are_no_scenes(tmp_path):
 
 
 def test_several_folders_are_searched_in_order(tmp_path):
-    first, second = (write_scenes(tmp_path / name, [name], 5) for name in ("z", "exam"))
+    first = write_scenes(tmp_path / "z", ["z"], 5)
+    second = write_scenes(tmp_path / "exam", ["exam"], 6)
     sources = find_sources(tiny_data(first, folders=(first, second)), seed=0)
     assert [source.name for source in sources] == ["z", "exam"]
 

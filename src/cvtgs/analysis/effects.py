@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from cvtgs.checks import checked
 from cvtgs.config import EffectsConfig, SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.devices import chunk_length, row_chunks
@@ -104,6 +105,7 @@ class EffectPlan(Record):
     visibility: Effect
 
 
+@checked
 def plan_effects(
     scene: GaussianScene,
     masses: Float[Tensor, "n"],
@@ -124,6 +126,9 @@ def plan_effects(
 
     Returns:
         The plan.
+
+    Raises:
+        InvalidArgumentError: An argument has another type, or tensors have different lengths.
 
     Example:
         >>> from cvtgs.synthetic import scene as make

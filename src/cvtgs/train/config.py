@@ -137,9 +137,9 @@ class TrainConfig(Section):
     seed: int = pydantic.Field(default=0, ge=0, lt=1 << 63)
     steps: Count = 6000
     cases_per_step: Count = 1
-    learning_rate: float = pydantic.Field(default=5e-3, gt=0.0)
+    learning_rate: float = pydantic.Field(default=5e-3, gt=0.0, le=1.0)
     restart_step: int = pydantic.Field(default=0, ge=0)
-    restart_rate: float = pydantic.Field(default=1e-3, gt=0.0)
+    restart_rate: float = pydantic.Field(default=1e-3, gt=0.0, le=1.0)
     width: Width = 48
     cell_width: CellWidth = 96
     largest_growth: float = pydantic.Field(default=0.6, gt=0.0, le=3.0)

@@ -76,6 +76,13 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
                 f"data.folders: {times} scenes would be named {name}, of {named}; use a file once, "
                 f"and rename others."
             )
+    learned = {one.origin.sha256: one.name for one in sources if not one.is_validation}
+    for source in sources:
+        if source.is_validation and source.origin.sha256 and source.origin.sha256 in learned:
+            warn(
+                f"{source.name}.ply is for validation, but {learned[source.origin.sha256]} of the "
+                f"same content is for training."
+            )
     for is_validation, text in ((False, "training"), (True, "validation")):
         if not any(source.is_validation == is_validation for source in sources):
             raise ConfigError(f"data: at least one {text} scene is needed, found none.")
