@@ -99,9 +99,23 @@ def test_a_gaussian_of_any_valid_scale_is_drawn(backend, dtype, log_scale):
 
 
 @backends
+@pytest.mark.parametrize("log_scale", [50.0, 80.0])
+def test_a_huge_gaussian_before_others_is_as_in_float64(backend, log_scale):
+    """It is turned, so that its ellipse has no axis along the image."""
+    scene = random_scene(60, degree=0, size=0.1)
+    log_scales = scene.log_scales.clone()
+    log_scales[3] = torch.tensor([log_scale, log_scale - 2, log_scale - 1])
+    scene = scene.with_tensors({"log_scales": log_scales}, {})
+    double = scene.with_tensors({k: v.double() for k, v in scene.tensors().items()}, {})
+    found = render(scene, around(), backend=backend).rgb
+    wanted = render(double, around(), backend="torch").rgb.float()
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-4)
+
+
+@backends
 def test_rows_that_are_not_finite_are_not_rendered(backend):
-    good = random_scene(10, degree=0, size=0.3)
-    for name in ("means", "quats", "log_scales", "logit_opacities"):
+    good = random_scene(10, degree=1, size=0.3)
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN"):
         for bad in (math.nan, math.inf):
             if (name, bad) == ("logit_opacities", math.inf):
                 continue

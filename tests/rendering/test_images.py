@@ -229,6 +229,11 @@ def test_wrong_arguments_are_refused(options, text):
     assert str(caught.value) == text
 
 
+def test_numbers_beyond_floats_are_no_background():
+    with pytest.raises(InvalidArgumentError, match="background must be three numbers, or a tensor"):
+        render(random_scene(3), around(1), background=(10**400, 0, 0))
+
+
 @pytest.mark.parametrize(
     ("changes", "wish"),
     [

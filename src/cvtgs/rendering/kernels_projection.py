@@ -19,6 +19,7 @@ from cvtgs.rendering.compiled import (
 from cvtgs.rendering.projection import NEAR_PLANE
 
 CHUNK = 256  # Gaussians per step of a parallel loop, which share their scratch arrays
+LEAST = 1e-37  # smallest inverse of a variance, which float32 holds; that of huge Gaussians
 
 C2A, C2B = SH_C2
 C3A, C3B, C3C, C3D = SH_C3
@@ -151,7 +152,7 @@ def splat_of(axes: Array, local: Array, camera: Array, opacity: float, out: Arra
     if not (is_beside and y + high >= 0 and y - high <= camera[8, 1]):
         return False
     out[0], out[1], out[9] = x, y, local[2]
-    out[2], out[3], out[4] = -0.5 / schur, -b / d, -0.5 / d
+    out[2], out[3], out[4] = -max(0.5 / schur, LEAST), -b / d, -max(0.5 / d, LEAST)
     out[5] = math.log(opacity)
     return True
 
@@ -189,7 +190,8 @@ def project_all(
             color_of((sh0[i], rest[i]), offset, degree, basis, color)
             for channel in range(3):
                 packed[i, 6 + channel] = max(0.0, color[channel])
-            visible[i], depths[i] = True, local[2]
+            depths[i] = local[2]
+            visible[i] = math.isfinite(color[0] + color[1] + color[2])
 
 
 @serial

@@ -187,12 +187,16 @@ def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
     slopes = local[:, :2] / local[:, 2:]
     centers = slopes * beside.focal + beside.principal
     order = _front_to_back(centers, ellipses, opacities, _depths(means, beside), camera)
+    colors = _colors(scene, rows[order], offsets[order], sh_degree)
+    finite = colors.isfinite().all(dim=1)
+    if colors.device.type == "cpu" and not bool(finite.all()):  # elsewhere, the host would wait
+        order, colors = order[finite], colors[finite]
     return Splats(
         rows=rows[order],
         centers=centers[order],
         ellipses=ellipses[order],
         opacities=opacities[order],
-        colors=_colors(scene, rows[order], offsets[order], sh_degree),
+        colors=colors,
         depths=local[:, 2][order],
     )
 

@@ -67,8 +67,8 @@ def render(
     tiles; here they end where alpha falls under 1/255, so images do not depend on tiles.
 
     Images are differentiable with respect to means, quats, log scales, opacity logits, sh0, shN and
-    the background; cameras are constants. Gaussians with a non-finite position, shape or opacity
-    contribute nothing. Autocast of torch has no effect.
+    the background; cameras are constants. Gaussians with a non-finite position, shape, opacity or
+    (on a CPU) colour contribute nothing. Autocast of torch has no effect.
 
     Memory: each backend's ``rasterize`` states its formula. Cameras are rendered one by one, by
     ``numba`` without gradients up to four at a time, by ``gsplat`` as many as have four million
@@ -385,7 +385,7 @@ def _background(
     try:
         colors = torch.as_tensor(background, dtype=scene.dtype, device=device)
         found = f"shape {tuple(colors.shape)}"
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         colors, found = None, shown(background)
     if colors is None or colors.shape not in ((3,), (len(cameras), 3)):
         raise InvalidArgumentError(
