@@ -120,7 +120,8 @@ def test_images_smaller_than_the_window_are_refused_by_ssim(size) -> None:
         with pytest.raises(InvalidArgumentError) as error:
             loss(first, second)
         assert str(error.value) == (
-            f"there must be images of at least 11 x 11 pixels, found 1 of {size[1]} x {size[0]}."
+            "there must be images of at least 11 x 11 pixels, found 1 image of "
+            f"{size[1]} x {size[0]}."
         )
 
 
@@ -183,7 +184,7 @@ def test_error_texts(loss, case) -> None:
 
 @pytest.mark.parametrize("loss", [*LOSSES, relative_loss])
 def test_no_images_are_refused(loss) -> None:
-    with pytest.raises(InvalidArgumentError, match=r"there must be images .*, found 0 of 12 x 12"):
+    with pytest.raises(InvalidArgumentError, match=r"there must be .*, found 0 images of 12 x 12"):
         loss(ZEROS[:0], ZEROS[:0])
 
 

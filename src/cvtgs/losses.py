@@ -13,6 +13,7 @@ from cvtgs.counts import real_number
 from cvtgs.devices import without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import positive_log
+from cvtgs.text import counted
 
 __all__ = ["gradient_loss", "image_loss", "l1_loss", "relative_loss", "ssim_loss"]
 
@@ -284,6 +285,6 @@ def check_pair(
     height, width = prediction.shape[1:3]
     if len(prediction) == 0 or min(height, width) < least:
         raise InvalidArgumentError(
-            f"there must be images of at least {least} x {least} pixels, found {len(prediction)} "
-            f"of {width} x {height}."
+            f"there must be images of at least {least} x {least} pixels, found "
+            f"{counted(len(prediction), 'image')} of {width} x {height}."
         )

@@ -116,7 +116,8 @@ def test_invalid_arguments_are_refused() -> None:
     with pytest.raises(InvalidArgumentError) as error:
         lpips(*images, network="alex", weights=random_weights("alex"))
     assert (
-        str(error.value) == "there must be images of at least 31 x 31 pixels, found 1 of 40 x 30."
+        str(error.value)
+        == "there must be images of at least 31 x 31 pixels, found 1 image of 40 x 30."
     )
     with pytest.raises(InvalidArgumentError) as error:
         lpips(*images, weights=random_weights("alex"))

@@ -130,7 +130,8 @@ def test_images_that_do_not_fit_are_refused() -> None:
     with pytest.raises(InvalidArgumentError) as error:
         ssim(image, image)
     assert (
-        str(error.value) == "there must be images of at least 11 x 11 pixels, found 1 of 12 x 10."
+        str(error.value)
+        == "there must be images of at least 11 x 11 pixels, found 1 image of 12 x 10."
     )
     with pytest.raises(InvalidArgumentError, match=r"must be .* of shape \(1, 10, 12, 3\), found"):
         psnr(image, image[:, :5])

@@ -256,7 +256,7 @@ def test_wrong_levels_and_chunk_sizes_are_refused(levels: tuple[Level, ...]) -> 
     for wrong in ([], [levels[0], levels[0]]):
         with pytest.raises(InvalidArgumentError, match="needs levels of different sizes"):
             plan_stream(wrong)
-    with pytest.raises(InvalidArgumentError, match="and chunks of 0"):
+    with pytest.raises(InvalidArgumentError, match="chunk_gaussians must be a whole number"):
         plan_stream(levels, chunk_gaussians=0)
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from cvtgs.analysis.effects import select_columns
 from cvtgs.checks import checked
 from cvtgs.clock import StageClock
-from cvtgs.counts import shared_out, target_count, whole_number, written_ratios
+from cvtgs.counts import checked_whole, shared_out, target_count, written_ratios
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, check_path, warn
 from cvtgs.grouping import finer_count
@@ -231,11 +231,11 @@ def stream_file(  # noqa: PLR0913 (options by name)
     rows = open_rows(source)
     ratios = written_ratios(rhos)
     targets = sorted({target_count(rows.count, rho) for rho in ratios}, reverse=True)
-    if len(targets) < len(ratios) or not targets or whole_number(chunk_gaussians) < 1:
+    checked_whole(chunk_gaussians, "chunk_gaussians")
+    if len(targets) < len(ratios) or not targets:
         raise InvalidArgumentError(
-            f"a stream needs levels of different sizes and chunks of at least one Gaussian, found "
-            f"ratios {ratios} of {counted(rows.count, 'Gaussian')} and chunks of "
-            f"{shown(chunk_gaussians)}; other ratios help a small scene."
+            f"a stream needs levels of different sizes, found ratios {ratios} of "
+            f"{counted(rows.count, 'Gaussian')}; other ratios help a small scene."
         )
     merged = [target for target in targets if target < rows.count] or targets
     room = memory or memory_to_plan()

@@ -179,7 +179,7 @@ def join_trees(
 
 def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool = False) -> None:
     """Check that a stream can be written, before the long work starts."""
-    if kind not in INDEX_NAMES:
+    if not isinstance(kind, str) or kind not in INDEX_NAMES:
         names = " or ".join(INDEX_NAMES)
         raise InvalidArgumentError(f"kind of a stream must be {names}, found {kind!r}.")
     check_path(folder)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.boxes import Corner
-from cvtgs.counts import real_number, whole_number
+from cvtgs.counts import checked_whole, real_number
 from cvtgs.cvt import nearest_site
 from cvtgs.devices import on_host
 from cvtgs.errors import InvalidArgumentError
@@ -159,7 +159,8 @@ def plan_stream(
         250
     """
     check_environment(environment_radii)
-    for level in levels:
+    checked_whole(chunk_gaussians, "chunk_gaussians")
+    for level in levels if isinstance(levels, Sequence) else [levels]:
         if not hasattr(level, "assignment"):
             raise InvalidArgumentError(
                 f"levels must be those that Simplifier.levels returns, found {shown(level)}."
@@ -171,11 +172,10 @@ def plan_stream(
         )
     ordered = tuple(sorted(levels, key=lambda level: -len(level.scene)))
     counts = [len(level.scene) for level in ordered]
-    if not counts or len(set(counts)) < len(counts) or whole_number(chunk_gaussians) < 1:
+    if not counts or len(set(counts)) < len(counts):
         raise InvalidArgumentError(
-            f"a stream needs levels of different sizes and chunks of at least one Gaussian, found "
-            f"levels of {counts} and chunks of {shown(chunk_gaussians)}; other ratios help a "
-            f"small scene."
+            f"a stream needs levels of different sizes, found levels of {counts}; other ratios "
+            f"help a small scene."
         )
     near = near_rows(ordered[-1].scene, robust_frame(ordered[0].scene.means), environment_radii)
     return plan_part(ordered, near, chunk_gaussians=chunk_gaussians)
