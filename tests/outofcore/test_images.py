@@ -15,7 +15,7 @@ from cvtgs.outofcore import LocalWorkers, simplify_file
 from cvtgs.outofcore import images as module
 from cvtgs.outofcore.memory import IMAGE_BYTES, LEAST_BYTES
 from cvtgs.report import MatchReport, RefineReport
-from cvtgs.views import automatic_views
+from cvtgs.views import automatic_views, mixed_views
 
 COUNT, LARGER_COUNT = 200, 800
 SEEDS = range(4, 12)
@@ -122,6 +122,26 @@ def test_what_is_near_a_block_reaches_half_of_its_diagonal_beyond_it():
     places = [[-2.4, 0, 0], [5.4, 6.4, 2.4], [1, 1, 0], [-2.6, 0, 0], [1, 6.6, 0], [1, 1, -2.6]]
     near = vars(module)["_near"](torch.tensor(places), own)
     assert near.tolist() == [True, True, True, False, False, False]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", [MATCHED, REFINED])
+def test_blocks_use_the_views_of_one_piece_if_they_are_fine_enough(
+    source, scene, tmp_path, monkeypatch, settings
+):
+    """Otherwise those of each block: of 400 x 400 pixels with more than 80,000 Gaussians."""
+    config = SimplifyConfig.from_mapping(settings)
+    size, most = config.visibility.size, config.visibility.size**2 // 2
+    assert [module.has_fine_views(config, count) for count in (most, most + 1)] == [True, False]
+    looks, real = [], module.observe
+    monkeypatch.setattr(module, "observe", lambda s, views: looks.append(views) or real(s, views))
+    in_blocks(source, tmp_path / "fine.ply", settings, blocks=2)
+    wanted = mixed_views(scene, config.visibility.views, size=size, seed=config.seed)
+    assert all(torch.equal(views.viewmats, wanted.viewmats) for views in looks)
+    monkeypatch.setattr(module, "PIXELS_EACH", 1e9)
+    in_blocks(source, tmp_path / "coarse.ply", settings, blocks=2)
+    assert len(looks) == 4
+    assert not any(torch.equal(views.viewmats, wanted.viewmats) for views in looks[2:])
 
 
 @pytest.mark.parametrize(

@@ -40,10 +40,14 @@ from cvtgs.refinement import refine
 from cvtgs.rendering import ObservedViews, contributions, error_shares, observe
 from cvtgs.report import MatchReport, RefineReport
 from cvtgs.scene import GaussianScene
-from cvtgs.views import find_view_positions, mixed_views
+from cvtgs.views import CameraPositions, find_view_positions, mixed_views
 
 MEASURED = "measured.json"  # file of the sums over all blocks
-SCENE = "scene/"
+SCENE, SEEN, LATER = "scene/", "seen/", "later/"
+"""Prefixes of the sample, and of views of the whole scene for matching and for refinement."""
+
+PIXELS_EACH = 2.0
+"""Pixels of an image per Gaussian that is kept, from which on all blocks use the same views."""
 
 NEAR = 0.5  # camera positions depend on Gaussians up to this share of a block's diagonal away
 SHOWS_BLOCK = 0.1  # share of the pixels of the best camera from which one is used for a block
@@ -54,21 +58,45 @@ LATER_SEED = 307  # added to the seed, so that views for refinement differ from 
 
 @one_thread()
 def write_views(job: Job, sample: GaussianScene, *, total: int) -> None:
-    """Choose cameras by a sample of ``total`` Gaussians, or from given ones; write both."""
-    cameras = visibility_cameras(sample, job.config, cameras=job.cameras)
+    """Choose views by a sample of ``total`` Gaussians, or from given cameras; write both."""
     enlarged = sample.log_scales + 0.5 * math.log(total / len(sample))
     tensors = sample.with_sh_degree(0).tensors() | {"log_scales": enlarged}
-    save_tensors(
-        job.views_path,
-        {
-            "viewmats": cameras.viewmats,
-            "Ks": cameras.Ks,
-            "strides": torch.tensor(cameras.strides, dtype=torch.int64),
-            "ignores_tag": torch.tensor(cameras.ignores_tag, dtype=torch.bool),
-            **add_prefix(SCENE, tensors),
-        },
-        {name: str(getattr(cameras, name)) for name in ("width", "height")},
-    )
+    contents = add_prefix(SCENE, tensors)
+    if job.cameras is None:
+        positions = find_view_positions(sample)
+        for name, views in _views_from(positions, job.config, sharp=True).items():
+            contents |= add_prefix(name, _packed(views))
+    save_tensors(job.views_path, contents, {})
+
+
+def _views_from(
+    positions: CameraPositions, config: SimplifyConfig, *, sharp: bool
+) -> dict[str, Cameras]:
+    """Choose views for contributions and matching, and others for a refinement."""
+    make, seed = partial(mixed_views, positions, sharp=sharp), config.seed
+    found = dict[str, Cameras]()
+    if config.uses_renders:
+        found[SEEN] = make(config.visibility.views, size=config.visibility.size, seed=seed)
+    if config.refine.enabled:
+        later = later_views(config)
+        found[LATER] = make(later, size=config.refine.size, seed=seed + LATER_SEED)
+    return found
+
+
+def _packed(cameras: Cameras) -> dict[str, Tensor]:
+    size = torch.tensor([cameras.width, cameras.height])
+    return {"viewmats": cameras.viewmats, "Ks": cameras.Ks, "size": size}
+
+
+def _scene_views(job: Job) -> dict[str, Cameras]:
+    """Read the views of the whole scene."""
+    tensors, found = map_tensors(job.views_path)[0], dict[str, Cameras]()
+    for name in (SEEN, LATER):
+        own = under_prefix(name, tensors)
+        if own:
+            width, height = own.pop("size").tolist()
+            found[name] = Cameras(**own, width=width, height=height)
+    return found
 
 
 @one_thread()
@@ -77,16 +105,10 @@ def measure(job: Job, block: int) -> None:
     if job.has("contributions", block):
         return
     scan, rows = job.read_scan(), read_rows(job, block, is_slim=True)
-    tensors, facts = map_tensors(job.views_path)
-    cameras = Cameras(
-        viewmats=tensors["viewmats"],
-        Ks=tensors["Ks"],
-        width=int(facts["width"]),
-        height=int(facts["height"]),
-        strides=tuple(tensors["strides"].tolist()),
-        ignores_tag=tuple(tensors["ignores_tag"].tolist()),
-    )
+    tensors = map_tensors(job.views_path)[0]
     sample = rows.scene.with_tensors(under_prefix(SCENE, tensors), {})
+    given = _scene_views(job)[SEEN] if job.cameras is None else job.cameras
+    cameras = visibility_cameras(sample, job.config, cameras=given)
     blocks = scan.partition.blocks_of(scan.frame.contract(sample.means))
     others = sample.select((blocks != block) | inside(job.boxes, sample.means))
     drawn = drop_mip_tag(concatenate([rows.scene, others]), scan.plan)
@@ -212,7 +234,7 @@ def _allocate_again(
 
 def _choose_views(job: Job, drawn: Drawn) -> tuple[Cameras | None, Cameras | None]:
     """Return cameras that look at a block, given or new: for matching and for refinement."""
-    config, seed = job.config, job.config.seed
+    config = job.config
     matches, refines = config.match.enabled and config.uses_renders, config.refine.enabled
     members = drawn.full[drawn.fixed :]
     if job.cameras is not None:
@@ -221,17 +243,24 @@ def _choose_views(job: Job, drawn: Drawn) -> tuple[Cameras | None, Cameras | Non
             return None, None
         views = visibility_cameras(members, config, cameras=shown) if matches else None
         return views, shown if refines else None
-    fixed = drawn.small[: drawn.fixed]
-    own = drawn.small.means[drawn.fixed :]
-    near = fixed.select(_near(fixed.means, own))
-    make = partial(mixed_views, find_view_positions(concatenate([members, near])), sharp=False)
-    views, later = None, None
-    if matches:
-        views = make(config.visibility.views, size=config.visibility.size, seed=seed)
-        views = visibility_cameras(members, config, cameras=views)
-    if refines:
-        later = make(later_views(config), size=config.refine.size, seed=seed + LATER_SEED)
-    return views, later
+    if has_fine_views(config, job.target):
+        found = _scene_views(job)
+    else:
+        fixed = drawn.small[: drawn.fixed]
+        near = fixed.select(_near(fixed.means, drawn.small.means[drawn.fixed :]))
+        around = find_view_positions(concatenate([members, near]))
+        found = _views_from(around, config, sharp=False)
+    views = visibility_cameras(members, config, cameras=found[SEEN]) if matches else None
+    return views, found[LATER] if refines else None
+
+
+def has_fine_views(config: SimplifyConfig, count: int) -> bool:
+    """Return whether images of the whole scene have enough pixels for the Gaussians that are kept.
+
+    Then blocks use the views of a run in one piece. Otherwise, views of a block show more of it.
+    """
+    size = config.visibility.size if config.uses_renders else config.refine.size
+    return size**2 >= PIXELS_EACH * count
 
 
 def later_views(config: SimplifyConfig) -> int:

@@ -31,7 +31,7 @@ from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, wr
 SENT_BYTES = "sent_bytes"  # entry of the label file of a block: bytes of the file of its sent rows
 
 
-FILES_VERSION = 5
+FILES_VERSION = 6
 """Number of the layout of these files: raise it with every change, so that no run continues with
 files of another layout."""
 
@@ -240,7 +240,7 @@ class Job:
         """
         try:
             self.read_scan()
-            if self.config.uses_renders:
+            if self.config.uses_images:
                 map_tensors(self.views_path)
             if self.read_manifest().key != key or not self.has_sorted_rows():
                 return False

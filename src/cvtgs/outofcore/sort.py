@@ -127,7 +127,7 @@ def _scan(
         raise InvalidArgumentError(
             f"all {kept:,} valid Gaussians are protected, so there is nothing to simplify."
         )
-    if job.config.uses_renders:
+    if job.config.uses_images:
         write_views(job, sample, total=valid)
     rest = min(job.target, valid) - kept
     scan = scan_scene(
