@@ -111,6 +111,11 @@ def test_simplify_and_info_accept_every_format(
     assert "Gaussians        20" in capsys.readouterr().out
 
 
+def test_losses_depend_on_the_version_of_a_spz() -> None:
+    steps = [losses(storable_scene(3), "a.spz", spz_version=v).changed[2] for v in (2, 3)]
+    assert steps == [f"rotations in steps of 1/{count} per component" for count in (127, 723)]
+
+
 def test_losses_depend_on_the_format() -> None:
     scene = storable_scene(3)
     assert losses(scene, "a.ply") == Losses(dropped=(), changed=(), count=3, sh_degree=3)

@@ -150,6 +150,10 @@ def test_a_scene_that_fails_does_not_stop_the_others(
         (["nothing*", "-o", "out"], "nothing*: the pattern must match a file, found none."),
         (["a.ply", "-o", "note"], "note: must be a folder or a new path, found: "),
         (["a.ply", "c.spz", "-o", "out", "--suffix", "xyz"], "--suffix must end in "),
+        (
+            ["c.spz", "a.ply", "-o", "other", "--merge", "other/a.ply"],
+            "the output of a.ply must not replace another input, found other/a.ply.",
+        ),
     ],
 )
 def test_invalid_jobs_are_refused_before_the_work(

@@ -56,6 +56,13 @@ def test_centres_shapes_and_colours_change_consistently(source: str, target: str
     torch.testing.assert_close(after, before, rtol=1e-12, atol=1e-12)
 
 
+def test_autocast_does_not_round_turned_scenes() -> None:
+    scene = random_scene(20, degree=2)
+    wanted = change_axes(scene, "rdf", "rfu")
+    with torch.autocast("cpu", torch.bfloat16):
+        assert same_bits(change_axes(scene, "rdf", "rfu"), wanted)
+
+
 @pytest.mark.parametrize("axes", AXES[:8])
 def test_only_signs_change_if_no_axes_are_swapped(axes: str) -> None:
     scene = random_scene(20, degree=2)

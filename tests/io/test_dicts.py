@@ -102,6 +102,14 @@ def test_half_becomes_float32_and_double_stays(dtype: torch.dtype, wanted: torch
     assert {tensor.dtype for tensor in scene.tensors().values()} == {wanted}
 
 
+def test_longer_floats_of_numpy_are_refused() -> None:
+    values = gsplat()
+    means = values["means"].numpy().astype(np.longdouble)
+    if means.dtype.itemsize > 8:  # some systems have none
+        with pytest.raises(InvalidSceneError, match="means must be a torch"):
+            from_dict({**values, "means": means})
+
+
 def test_missing_view_dependent_colour_gives_degree_0() -> None:
     values = gsplat()
     del values["shN"]

@@ -5,7 +5,7 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import cvtgs
 from cvtgs.cli.display import say, say_wrapped
@@ -341,7 +341,8 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
     if options.sh_degree is not None and options.sh_degree < scene.sh_degree:
         scene = scene.with_sh_degree(options.sh_degree)
         phrases += [f"SH bands above degree {options.sh_degree} (--sh-degree)"]
-    lost = cvtgs.io.losses(scene, options.output)
+    version: Literal[2, 3, 4] = options.spz_version or 3
+    lost = cvtgs.io.losses(scene, options.output, spz_version=version)
     if not (options.quiet or job.is_one_of_many):
         stream, files = sys.stdout, f"files like {options.output.name}"
         if job.to_stream:
@@ -358,7 +359,7 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
             options.output,
             overwrite=options.overwrite,
             axes=axes.target,
-            spz_version=options.spz_version or 3,
+            spz_version=version,
         )
     lines = [*phrases, *lost.dropped]
     notes = [f"Lost: {'; '.join(lines)}."] if job.is_one_of_many and lines else []

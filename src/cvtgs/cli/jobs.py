@@ -244,7 +244,7 @@ def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
             )
         targets[options.folder / name] = source
     for target, source in targets.items():
-        for other in sources:
+        for other in [*sources, *getattr(options, "merge", ())]:
             if other != source and is_same_file(target, other):
                 raise InvalidArgumentError(
                     f"the output of {source} must not replace another input, found {target}."

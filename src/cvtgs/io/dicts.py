@@ -239,7 +239,8 @@ def check_tensors(mapping: Mapping[Any, Any]) -> None:
 def _as_tensor(key: str, value: Tensor | NDArray[Any]) -> Tensor:
     if isinstance(value, np.ndarray):
         native = value.dtype.newbyteorder("=")
-        value = torch.from_numpy(value.astype(native)) if native.kind == "f" else value
+        is_known = native.kind == "f" and native.itemsize <= 8  # not numpy's longdouble
+        value = torch.from_numpy(value.astype(native)) if is_known else value
     if not isinstance(value, Tensor) or not value.is_floating_point():
         raise InvalidSceneError(
             f"{key} must be a torch.Tensor or numpy array of floats, "

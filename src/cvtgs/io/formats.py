@@ -22,7 +22,7 @@ from cvtgs.errors import (
 from cvtgs.io.atomic import atomic_output, check_output
 from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
 from cvtgs.io.files import check_degree, is_file, scene_file
-from cvtgs.io.limits import FORMAT_LIMITS, Losses, losses_within
+from cvtgs.io.limits import FORMAT_LIMITS, SPZ_2, Losses, losses_within
 from cvtgs.io.streams import ByteSink, ByteSource, file_of, name_of, written_to
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene, check_scene
@@ -269,12 +269,13 @@ def tagged_if_flat(scene: GaussianScene) -> GaussianScene:
     return replace(scene, comments=(*scene.comments, TWO_SCALES.text))
 
 
-def losses(scene: GaussianScene, path: str | os.PathLike[str]) -> Losses:
+def losses(scene: GaussianScene, path: str | os.PathLike[str], *, spz_version: int = 3) -> Losses:
     """Report which data of a scene a file would not hold, without writing it.
 
     Args:
         scene: The scene.
         path: The file, of which only the name is used, or the suffix of a format.
+        spz_version: Version of a ``.spz``, as in :func:`save`.
 
     Returns:
         The data that would be dropped, and rounded or reordered (none for a ``.ply``), and the
@@ -293,7 +294,8 @@ def losses(scene: GaussianScene, path: str | os.PathLike[str]) -> Losses:
     check_path(path)
     dotted = f".{os.fspath(path)}"
     named = dotted if dotted.lower() in _WRITERS else path
-    limits = FORMAT_LIMITS.get(_suffix_of(named, _WRITERS))
+    suffix = _suffix_of(named, _WRITERS)
+    limits = SPZ_2 if suffix == ".spz" and spz_version == 2 else FORMAT_LIMITS.get(suffix)
     if limits is None:
         return Losses(dropped=(), changed=(), count=len(scene), sh_degree=scene.sh_degree)
     return losses_within(scene, limits)

@@ -57,6 +57,8 @@ def _largest_spz_coordinate(scene: GaussianScene) -> float:
     return largest_coordinate(scene)
 
 
+_SPZ_ROTATIONS = "rotations in steps of 1/723 per component"
+
 _SPZ = FormatLimits(  # of versions 3 and 4
     sh_degree=3,
     antialiased=True,
@@ -69,12 +71,21 @@ _SPZ = FormatLimits(  # of versions 3 and 4
     changed=(
         "positions in steps of 1/4096 (finer in scenes below 8 units, coarser above 2,048)",
         "scales in steps of 6.4 %",
-        "rotations in steps of 1/723 per component",
+        _SPZ_ROTATIONS,
         "opacities in steps of 1/255",
         "colours in steps of 0.0074",
     ),
     changed_bands="view-dependent SH coefficients in steps of 1/16 (degree 1) and 1/8",
 )
+
+SPZ_2 = replace(
+    _SPZ,
+    changed=tuple(
+        "rotations in steps of 1/127 per component" if phrase == _SPZ_ROTATIONS else phrase
+        for phrase in _SPZ.changed
+    ),
+)
+"""What a ``.spz`` of version 2 loses."""
 
 _GLTF = FormatLimits(
     sh_degree=3,
