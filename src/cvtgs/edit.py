@@ -333,23 +333,23 @@ def merge(scenes: Iterable[GaussianScene]) -> GaussianScene:
         )
     dtype = torch.float64 if any(s.dtype == torch.float64 for s in scenes) else torch.float32
     degree = max(scene.sh_degree for scene in scenes)
-    same_layout = len({scene.layout for scene in scenes}) == 1
-    alike = [_widened(scene, degree, dtype, common) for scene in scenes]
+    layout = scenes[0].layout if len({scene.layout for scene in scenes}) == 1 else ()
+    plain = [replace(s, comments=TWO_SCALES.removed_from(s.comments), layout=()) for s in scenes]
+    alike = [_widened(scene, degree, dtype, common) for scene in plain]
     comments = tuple(dict.fromkeys(line for scene in scenes for line in scene.comments))
     if not all(scene.has_two_scales for scene in scenes):
         comments = TWO_SCALES.removed_from(comments)
-    elif not same_layout and not TWO_SCALES.is_in(comments):  # then no layout says so
+    elif not layout and not TWO_SCALES.is_in(comments):  # then no layout says so
         comments = (*comments, TWO_SCALES.text)
-    merged = concatenate(alike)
-    return replace(merged, comments=comments, layout=scenes[0].layout if same_layout else ())
+    return replace(concatenate(alike), comments=comments, layout=layout)
 
 
 def concatenate(scenes: Iterable[GaussianScene]) -> GaussianScene:
     """Return the Gaussians of several scenes as one scene.
 
     Args:
-        scenes: At least one, of the same SH degree, dtype, device and extra columns; comments and
-            layout are those of the first. A warning says if only some are tagged mip.
+        scenes: At least one, of the same SH degree, number of scales, dtype, device and extra
+            columns; comments and layout are the first's. A warning says if only some are mip.
 
     Returns:
         All Gaussians, in the order of the scenes.
@@ -385,8 +385,8 @@ def concatenate(scenes: Iterable[GaussianScene]) -> GaussianScene:
 
 
 def _kind(scene: GaussianScene) -> str:
-    extras = sorted(scene.extras) or "none"
-    return f"SH degree {scene.sh_degree}, {scene.dtype} and extra columns {extras}"
+    scales, extras = 2 if scene.has_two_scales else 3, sorted(scene.extras) or "none"
+    return f"SH degree {scene.sh_degree}, {scales} scales, {scene.dtype}, extra columns {extras}"
 
 
 def _widened(

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from cvtgs import Simplifier, SimplifyConfig, load, save
+from cvtgs import Simplifier, SimplifyConfig, concatenate, load, save
 from cvtgs.edit import merge
-from cvtgs.errors import DroppedDataWarning
+from cvtgs.errors import DroppedDataWarning, InvalidSceneError
 from cvtgs.scene import FLAT_LOG_SCALE
 from cvtgs.streams import plan_stream, write_sog_stream, write_tiles
 from cvtgs.tags import TWO_SCALES
@@ -58,3 +58,15 @@ def test_thick_gaussians_have_no_tag() -> None:
     thick = Simplifier(config=config, device="cpu").simplify(tagged, 0.1)
     assert thick.comments == ("mine",)
     assert float(thick.log_scales[:, 2].amax()) > FLAT_LOG_SCALE + 1
+
+
+def test_scenes_of_two_and_of_three_scales_are_not_joined_but_merged() -> None:
+    """Joined, the thick ones would become flat in a file without a third scale."""
+    flat = flat_file(30, torch.float32)
+    thick = random_scene(20, degree=flat.sh_degree)
+    for scenes in ([flat, thick], [thick, flat]):
+        with pytest.raises(InvalidSceneError, match="scenes to join must be alike; the first has"):
+            concatenate(scenes)
+        merged = merge(scenes)
+        assert not merged.has_two_scales
+        assert len(merged) == 50

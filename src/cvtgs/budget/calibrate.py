@@ -144,8 +144,8 @@ def cost_model(
 
     It is measured again if the machine, the device, the number of threads, the versions of Python,
     torch or cvtgs, the installed renderers or the presets change, after 90 days, and if the cache
-    file is damaged. If the file cannot be written, a warning says so, and
-    this process keeps the result.
+    file is damaged. If the file cannot be written, a warning says so, and this process keeps the
+    result.
 
     Args:
         device: Device that the presets run on.

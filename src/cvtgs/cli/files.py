@@ -327,8 +327,9 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
             options.input, axes=axes.source, trust_sizes=options.trust_sizes, lod=options.lod
         )
     ]
+    kind = cvtgs.io.scene_file(options.input).suffix.lower()
     for path in options.merge:
-        alike = path.suffix.lower() == options.input.suffix.lower()
+        alike = cvtgs.io.scene_file(path).suffix.lower() == kind
         source = axes.source if alike else None  # other formats have axes of their own
         scenes.append(cvtgs.io.load(path, axes=source, trust_sizes=options.trust_sizes))
     # What is dropped is printed below instead.

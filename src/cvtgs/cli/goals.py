@@ -24,13 +24,13 @@ STARTED = time.perf_counter()  # approximate start of this process, from which a
 
 
 class ChosenPreset(NamedTuple):
-    """A preset, why it was chosen, the time that is left for the run, and what to do if it is not.
+    """A preset, why it was chosen, the time left for the run, and advice if it takes longer.
 
     Attributes:
         name: Name of the preset.
         reason: The sentence that explains the choice.
         left: Seconds that are left for the run.
-        advice: What to do if the run takes longer.
+        advice: What to do if it takes longer.
     """
 
     name: str
