@@ -369,5 +369,5 @@ def test_what_is_never_drawn_is_no_haze():
 
 def test_masses_of_other_gaussians_are_refused():
     scene = random_scene(5)
-    with pytest.raises(InvalidArgumentError, match=r"distances must be .* of shape \(5,\), found"):
+    with pytest.raises(InvalidArgumentError, match="distances must be one number for each"):
         plan_effects(scene, scene.masses, distances=torch.ones(4))

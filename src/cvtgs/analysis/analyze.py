@@ -17,7 +17,6 @@ from cvtgs.analysis.effects import (
     plan_haze,
 )
 from cvtgs.cameras import Cameras
-from cvtgs.checks import checked
 from cvtgs.config import SimplifyConfig, TessellationConfig
 from cvtgs.devices import row_chunks
 from cvtgs.errors import InvalidArgumentError
@@ -26,6 +25,7 @@ from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import divide
 from cvtgs.rendering import ObservedViews, contributions, observe
 from cvtgs.scene import GaussianScene
+from cvtgs.text import shown
 from cvtgs.views import mixed_views
 
 MIN_OPACITY = 1e-6  # floor of opacities in divisions
@@ -90,7 +90,6 @@ class SceneAnalysis:
         )
 
 
-@checked
 def analyze(
     scene: GaussianScene, config: SimplifyConfig, *, with_visibility: bool = False
 ) -> SceneAnalysis:
@@ -105,7 +104,7 @@ def analyze(
         Frame, areas, visibility and effect plan.
 
     Raises:
-        InvalidArgumentError: The scene is empty, or an argument has another type.
+        InvalidArgumentError: The scene is none, or empty.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -113,8 +112,10 @@ def analyze(
         >>> analysis.plan.unbounded.active, len(analysis.areas)
         (False, 100)
     """
-    if len(scene) == 0:
-        raise InvalidArgumentError("an empty scene cannot be analyzed.")
+    if not isinstance(scene, GaussianScene) or scene.means.numel() == 0:
+        raise InvalidArgumentError(
+            f"scene must be a GaussianScene of at least one Gaussian, found {shown(scene)}."
+        )
     areas, opacities = scene.areas, scene.opacities
     frame = frame_of(scene.means, opacities)
     distances, masses = frame.distances(scene.means), areas * opacities

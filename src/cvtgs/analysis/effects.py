@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.checks import checked
 from cvtgs.config import EffectsConfig, SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.devices import chunk_length, row_chunks
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import MIN_ALPHA, divide, opacity_from_logit
 from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
 from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
@@ -105,7 +105,6 @@ class EffectPlan(Record):
     visibility: Effect
 
 
-@checked
 def plan_effects(
     scene: GaussianScene,
     masses: Float[Tensor, "n"],
@@ -128,7 +127,7 @@ def plan_effects(
         The plan.
 
     Raises:
-        InvalidArgumentError: An argument has another type, or tensors have different lengths.
+        InvalidArgumentError: Tensors have different lengths.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -139,6 +138,13 @@ def plan_effects(
     config = config or SimplifyConfig()
     choices = config.effects
     apparent = masses if apparent_masses is None else apparent_masses
+    for name, values in (
+        ("masses", masses),
+        ("apparent_masses", apparent),
+        ("distances", distances),
+    ):
+        if values.shape != scene.logit_opacities.shape:
+            raise InvalidArgumentError(f"{name} must be one number for each Gaussian of the scene.")
     shares = [
         far_share(distances, masses * drawn_rows(scene.opacities)),
         haze_share(scene.opacities, apparent, config),
