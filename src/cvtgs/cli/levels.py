@@ -172,9 +172,10 @@ def _cameras_to_fit(options: argparse.Namespace, scene: "GaussianScene") -> "Cam
 
 def _checked_views(options: argparse.Namespace, scene: "GaussianScene") -> "Cameras":
     """Return the views that score; raise before the long work if the levels cannot be scored."""
+    from cvtgs.devices import chosen_device
     from cvtgs.evaluation.compare import check_scores
 
-    full = cvtgs.validity.valid_part(scene)
+    full = cvtgs.validity.valid_part(scene).to(chosen_device(options.device))
     views = choose_cameras(options, full)
     check_scores(full, views, settings=evaluation_settings(options), name=options.input.name)
     return views
