@@ -21,7 +21,7 @@ def symmetric_eigen(
     if matrices.device.type != "cuda":
         try:
             values, axes = torch.linalg.eigh(matrices)
-        except RuntimeError:  # of torch.linalg, for NaN
+        except torch.linalg.LinAlgError:  # type: ignore[attr-defined]  # for NaN
             raise InvalidArgumentError(
                 "covariances must be finite, found NaN or infinity; cvtgs.validity.check_rows "
                 "removes Gaussians with such values."

@@ -76,12 +76,13 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
                 f"data.folders: {times} scenes would be named {name}, of {named}; use a file once, "
                 f"and rename others."
             )
-    learned = {one.origin.sha256: one.name for one in sources if not one.is_validation}
-    for source in sources:
-        if source.is_validation and source.origin.sha256 and source.origin.sha256 in learned:
+    origins = [source.origin for source in sources if source.origin.sha256]
+    learned = {one.sha256: one.name for one in origins if not one.is_validation}
+    for one in origins:
+        if one.is_validation and one.sha256 in learned:
             warn(
-                f"{source.name}.ply is for validation, but {learned[source.origin.sha256]} of the "
-                f"same content is for training."
+                f"{one.name}.ply is for validation, but {learned[one.sha256]}.ply of the same "
+                f"content is for training."
             )
     for is_validation, text in ((False, "training"), (True, "validation")):
         if not any(source.is_validation == is_validation for source in sources):
