@@ -9,8 +9,8 @@ import torch
 
 import oracles
 from cvtgs import GaussianScene
-from cvtgs.boxes import Box
-from cvtgs.edit import Motion, Sphere, crop, drop_faint, drop_large, merge, move
+from cvtgs.boxes import Box, Sphere
+from cvtgs.edit import Motion, concatenate, crop, drop_faint, drop_large, merge, move
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
 from cvtgs.io import change_axes
 from cvtgs.math.spherical_harmonics import rotated_rest
@@ -274,6 +274,17 @@ def test_merged_scenes_keep_their_sh_bands_and_get_zeros_above() -> None:
     assert torch.equal(both.shN[:3, :3], first.shN)
     assert not both.shN[:3, 3:].any()
     assert torch.equal(both.shN[3:], second.shN)
+
+
+@pytest.mark.parametrize("join", [merge, concatenate])
+def test_joined_columns_of_floats_and_integers_keep_large_integers(join) -> None:
+    """float32, to which torch would promote them, has no odd numbers above 2 ** 24."""
+    ids = torch.tensor([2**24 + 1, 7])
+    first = replace(random_scene(2), extras={"id": ids, "kind": ids.to(torch.uint8)})
+    second = replace(random_scene(1), extras={"id": torch.tensor([0.1]), "kind": ids[:1]})
+    joined = join([first, second]).extras
+    assert joined["id"].tolist() == [2**24 + 1, 7, torch.tensor(0.1).item()]
+    assert joined["kind"].dtype == torch.int64
 
 
 def test_scenes_of_several_layouts_merge_to_one_of_none() -> None:

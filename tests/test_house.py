@@ -20,8 +20,8 @@ TEXTS = {path: path.read_text(encoding="utf-8") for path in FILES}
 # modules it needs; `devices` and `cameras` (data) stand as low as their imports allow.
 LEVELS = [
     {"errors", "progress", "startup", "tags", "text"},
-    {"devices", "checks"},
-    {"math", "clock", "plots", "counts", "boxes"},
+    {"devices", "checks", "counts"},
+    {"math", "clock", "plots", "boxes"},
     {"config", "scene", "cameras", "processes"},
     {"validity", "edit"},
     {"io", "synthetic", "rendering", "losses"},

@@ -87,7 +87,7 @@ STAGES = {
         "mixed_views",
         "random_views",
     },
-    "boxes": {"Box", "inside", "read_boxes"},
+    "boxes": {"Box", "Sphere", "inside", "read_boxes"},
     "filters": {"FilteredRows", "filter_rows", "flyaway_rows", "visible_rows"},
     "math": {"frames", "parameters", "spherical_harmonics"},
     "pipeline": {

@@ -1,8 +1,9 @@
-"""Axis-aligned boxes, and masks of the Gaussians whose centres lie in them."""
+"""Boxes and spheres, and masks of the Gaussians whose centres lie in them."""
 
 import json
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import UnionType
 from typing import Any
@@ -15,11 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.checks import check_kinds
+from cvtgs.counts import finite_numbers
 from cvtgs.errors import InvalidArgumentError, check_path, input_errors
 from cvtgs.text import MOST_LETTERS, counted, shortened, shown
 
 __all__ = [
     "Box",
+    "Sphere",
     "inside",
     "read_boxes",
 ]
@@ -71,6 +74,36 @@ class Box(pydantic.BaseModel):
         return self
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sphere:
+    """A ball, surface included.
+
+    Attributes:
+        center: Centre, scene units.
+        radius: Radius, scene units, at least 0.
+
+    Raises:
+        InvalidArgumentError: A number is not finite, or the radius is negative.
+
+    Example:
+        >>> Sphere(center=(0.0, 0.0, 0.0), radius=1.0).radius
+        1.0
+    """
+
+    center: Corner
+    radius: float
+
+    def __post_init__(self) -> None:
+        center, radius = finite_numbers(self.center, 3), finite_numbers([self.radius], 1)
+        if center is None or radius is None or radius[0] < 0:
+            raise InvalidArgumentError(
+                f"a sphere needs a centre of 3 finite numbers and a radius of at least 0, "
+                f"found {shown(self.center)} and {shown(self.radius)}."
+            )
+        object.__setattr__(self, "center", center)
+        object.__setattr__(self, "radius", radius[0])
+
+
 def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
     """Read boxes from a JSON file.
 
@@ -116,18 +149,20 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
     return boxes
 
 
-def inside(boxes: Sequence[Box] | Box, means: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Return a mask of the centres that lie in any of some boxes.
+def inside(
+    regions: Sequence[Box | Sphere] | Box | Sphere, means: Float[Tensor, "n 3"]
+) -> Bool[Tensor, "n"]:
+    """Return a mask of the centres that lie in any of some boxes and spheres.
 
     Args:
-        boxes: The boxes, or a single one.
+        regions: The boxes and spheres, or a single one.
         means: Positions, scene units.
 
     Returns:
         The mask.
 
     Raises:
-        InvalidArgumentError: A box is something else, or positions are no floats of shape
+        InvalidArgumentError: A region is something else, or positions are no floats of shape
             ``(n, 3)``.
 
     Example:
@@ -135,12 +170,16 @@ def inside(boxes: Sequence[Box] | Box, means: Float[Tensor, "n 3"]) -> Bool[Tens
         >>> inside([box], torch.tensor([[0.5, 0.5, 1.0], [2.0, 0, 0]])).tolist()
         [True, False]
     """
-    boxes = listed(boxes, Box, required="boxes must be of type Box")
+    regions = listed(regions, Box | Sphere, required="regions must be boxes or spheres")
     check_kinds({"means": Float[Tensor, "n 3"]}, {"means": means})
     found = torch.zeros(len(means), dtype=torch.bool, device=means.device)
-    for box in boxes:
-        low, high = (means.new_tensor(corner) for corner in (box.min, box.max))
-        found |= ((means >= low) & (means <= high)).all(dim=1)
+    for region in regions:
+        if isinstance(region, Box):
+            low, high = (means.new_tensor(corner) for corner in (region.min, region.max))
+            found |= ((means >= low) & (means <= high)).all(dim=1)
+        else:
+            away = means.double() - means.new_tensor(region.center, dtype=torch.float64)
+            found |= away.square().sum(dim=1) <= region.radius * region.radius
     return found
 
 

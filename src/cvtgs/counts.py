@@ -137,6 +137,15 @@ def real_number(value: object) -> float:
         return math.nan
 
 
+def finite_numbers(values: Iterable[float], count: int) -> tuple[float, ...] | None:
+    """Return finite numbers of any type as floats; None if they are others."""
+    try:
+        numbers = () if isinstance(values, str | bytes) else tuple(map(real_number, values))
+    except TypeError:  # a single value
+        return None
+    return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else None
+
+
 def whole_number(number: object) -> int:
     """Return a whole number of any type, or -1 if it is none."""
     if is_truth_value(number) or not hasattr(number, "__index__"):

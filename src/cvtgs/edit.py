@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from cvtgs.boxes import Box, Corner, inside, listed
+from cvtgs.boxes import Box, Corner, Sphere, inside, listed
 from cvtgs.checks import checked
-from cvtgs.counts import real_number
+from cvtgs.counts import finite_numbers, real_number
 from cvtgs.devices import without_autocast
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError, warn
 from cvtgs.math.parameters import multiply_quats, rotation_matrices
@@ -18,40 +18,10 @@ from cvtgs.scene import NORMALS, GaussianScene, checked_scenes
 from cvtgs.tags import TWO_SCALES
 from cvtgs.text import shown
 
-__all__ = ["Motion", "Sphere", "concatenate", "crop", "drop_faint", "drop_large", "merge", "move"]
+__all__ = ["Motion", "concatenate", "crop", "drop_faint", "drop_large", "merge", "move"]
 
 _NO_TURN = (1.0, 0.0, 0.0, 0.0)
 _NO_SHIFT = (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sphere:
-    """A ball, surface included.
-
-    Attributes:
-        center: Centre, scene units.
-        radius: Radius, scene units, at least 0.
-
-    Raises:
-        InvalidArgumentError: A number is not finite, or the radius is negative.
-
-    Example:
-        >>> Sphere(center=(0.0, 0.0, 0.0), radius=1.0).radius
-        1.0
-    """
-
-    center: Corner
-    radius: float
-
-    def __post_init__(self) -> None:
-        center, radius = _numbers(self.center, 3), _numbers([self.radius], 1)
-        if center is None or radius is None or radius[0] < 0:
-            raise InvalidArgumentError(
-                f"a sphere needs a centre of 3 finite numbers and a radius of at least 0, "
-                f"found {shown(self.center)} and {shown(self.radius)}."
-            )
-        object.__setattr__(self, "center", center)
-        object.__setattr__(self, "radius", radius[0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,8 +47,8 @@ class Motion:
     shift: Corner = _NO_SHIFT
 
     def __post_init__(self) -> None:
-        quat, scale = _numbers(self.quat, 4), _numbers([self.scale], 1)
-        shift = _numbers(self.shift, 3)
+        quat, scale = finite_numbers(self.quat, 4), finite_numbers([self.scale], 1)
+        shift = finite_numbers(self.shift, 3)
         if quat is None or scale is None or shift is None:
             found = ", ".join(map(shown, (self.quat, self.scale, self.shift)))
             raise InvalidArgumentError(
@@ -111,7 +81,7 @@ class Motion:
         Raises:
             InvalidArgumentError: A number is not finite, or the factor is not above 0.
         """
-        degrees = _numbers(angles, 3)
+        degrees = finite_numbers(angles, 3)
         if degrees is None:
             raise InvalidArgumentError(
                 f"angles must be 3 finite numbers in degrees, found {shown(angles)}."
@@ -124,15 +94,6 @@ class Motion:
             quat = multiply_quats(turn, quat)
         w, x, y, z = quat[0].tolist()
         return cls(quat=(w, x, y, z), scale=scale, shift=shift)
-
-
-def _numbers(values: Iterable[float], count: int) -> tuple[float, ...] | None:
-    """Return finite numbers of any type as floats; None if they are others."""
-    try:
-        numbers = () if isinstance(values, str | bytes) else tuple(map(real_number, values))
-    except TypeError:  # a single value
-        return None
-    return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else None
 
 
 def _cos_sin(degrees: float) -> tuple[float, float]:
@@ -166,13 +127,7 @@ def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -
     regions = listed(regions, Box | Sphere, required="regions must be boxes or spheres")
     if not regions:
         raise InvalidArgumentError("crop needs at least one box or sphere, found none.")
-    keep = inside([region for region in regions if isinstance(region, Box)], scene.means)
-    for region in regions:
-        if isinstance(region, Sphere):
-            center = scene.means.new_tensor(region.center, dtype=torch.float64)
-            away = scene.means.double() - center
-            keep |= away.square().sum(dim=1) <= region.radius * region.radius
-    return _kept(scene, keep)
+    return _kept(scene, inside(regions, scene.means))
 
 
 @checked
@@ -380,8 +335,15 @@ def concatenate(scenes: Iterable[GaussianScene]) -> GaussianScene:
     tensors = [scene.tensors() for scene in scenes]
     return first.with_tensors(
         {name: torch.cat([each[name] for each in tensors]) for name in tensors[0]},
-        {name: torch.cat([scene.extras[name] for scene in scenes]) for name in first.extras},
+        {name: _joined([scene.extras[name] for scene in scenes]) for name in first.extras},
     )
+
+
+def _joined(columns: list[Tensor]) -> Tensor:
+    """Join columns; floats and integers become float64, since float32 would round large ids."""
+    if len({column.is_floating_point() for column in columns}) > 1:
+        columns = [column.double() for column in columns]
+    return torch.cat(columns)
 
 
 def _kind(scene: GaussianScene) -> str:

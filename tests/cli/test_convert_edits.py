@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from cvtgs import GaussianScene, load, save
-from cvtgs.boxes import Box
+from cvtgs.boxes import Box, Sphere
 from cvtgs.cli.main import main
-from cvtgs.edit import Motion, Sphere, crop, drop_faint, drop_large, merge, move
+from cvtgs.edit import Motion, crop, drop_faint, drop_large, merge, move
 from format_cases import storable_scene
 from scenes import random_scene, same_bits
 

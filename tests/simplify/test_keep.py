@@ -11,7 +11,7 @@ import torch
 
 import cvtgs
 from cvtgs import Simplifier, SimplifyConfig
-from cvtgs.boxes import Box, inside, read_boxes
+from cvtgs.boxes import Box, Sphere, inside, read_boxes
 from cvtgs.cli.main import main
 from cvtgs.errors import InputNotFoundError, InvalidArgumentError
 from cvtgs.refinement import refine
@@ -132,13 +132,15 @@ def test_boxes_include_their_faces():
     assert inside([box], points).tolist() == [True, True, False, False]
     assert inside([], points).tolist() == [False] * 4
     assert inside(box, points).tolist() == [True, True, False, False]
+    ball = Sphere(center=(-1, 0, 0), radius=1)
+    assert inside([ball, Box(min=(1, 1, 1), max=(1, 1, 1))], points).tolist() == [1, 1, 0, 1]
 
 
 @pytest.mark.parametrize(
     ("boxes", "points", "text"),
     [
-        (None, torch.zeros(2, 3), "boxes must be of type Box, found None."),
-        ([(0, 1)], torch.zeros(2, 3), "boxes must be of type Box, found (0, 1)."),
+        (None, torch.zeros(2, 3), "regions must be boxes or spheres, found None."),
+        ([(0, 1)], torch.zeros(2, 3), "regions must be boxes or spheres, found (0, 1)."),
         ([], torch.zeros(2, 2), "means must be a tensor of floats of shape (n, 3), found "
          "torch.float32 of shape (2, 2)."),
         ([], torch.zeros(2, 3).numpy(), "floats of shape (n, 3), found ndarray."),

@@ -101,8 +101,8 @@ Edit = Callable[["GaussianScene"], "GaussianScene"]
 
 def read_edits(options: argparse.Namespace) -> list[tuple[str, Edit]]:
     """Read the edits in their order, each after words for the Gaussians that it drops."""
-    from cvtgs.boxes import Box
-    from cvtgs.edit import Motion, Sphere
+    from cvtgs.boxes import Box, Sphere
+    from cvtgs.edit import Motion
 
     edit, edits, regions = cvtgs.edit, list[tuple[str, Edit]](), list[Box | Sphere]()
     for text in options.crop_box:
