@@ -39,6 +39,7 @@ from benchmarks.quality import (
     scoring_parser,
 )
 from cvtgs import cells
+from cvtgs.analysis.effects import CLAMPED, mean_clamped
 from cvtgs.mergenet import MergeNet, PublishedMergeNet, correct_cells, load_checkpoint
 from cvtgs.pipeline import merge_and_inflate
 from cvtgs.plots import Panel, Series, line_chart
@@ -243,6 +244,8 @@ def regroup(
         partition,
         config.merge,
         areas=scene.areas,
+        clamping=config.effects.clamping != "off"
+        and bool(mean_clamped(scene, scene.masses) > CLAMPED),
         with_network=net is not None and net.sees_surroundings,
     )
     if net is None:

@@ -20,9 +20,17 @@ import cvtgs
 from benchmarks.measuring import fastest, machine, renew_tables, run_python
 from benchmarks.quality import score_views
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
-from cvtgs.analysis.effects import BAND_LOSS, band_losses, duplicate_share, far_share, haze_share
+from cvtgs.analysis.effects import (
+    BAND_LOSS,
+    band_losses,
+    duplicate_share,
+    far_share,
+    haze_share,
+    mean_clamped,
+)
 from cvtgs.clock import peak_memory_bytes
 from cvtgs.math.frames import robust_frame
+from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import FLAT_LOG_SCALE
 from cvtgs.synthetic import scene as make
 from cvtgs.tags import ANTIALIASED
@@ -84,6 +92,11 @@ def repeated(count: int) -> GaussianScene:
     return make("courtyard", count // 4, sh_degree=0).select(torch.arange(count // 4).repeat(4))
 
 
+def darkened(count: int) -> GaussianScene:
+    scene = make("courtyard", count, sh_degree=1)
+    return scene.with_tensors(sh0=scene.sh0 - 0.4 / SH_C0)
+
+
 def with_columns(count: int) -> GaussianScene:
     columns = {f"column_{i}": torch.rand(count) for i in range(8)}
     return make("courtyard", count, sh_degree=0).with_tensors({}, columns)
@@ -96,6 +109,7 @@ CASES: Mapping[str, Case] = {
     "haze": Case(generated("haze"), without_faint),
     "flat": Case(surfels, generated("object"), on="auto"),
     "duplicates": Case(repeated, generated("courtyard")),
+    "clamping": Case(darkened, generated("courtyard", 1)),
     "extras": Case(with_columns, generated("courtyard"), on="auto"),
     "visibility": Case(generated("room"), generated("room"), on="auto", settings=LOOK),
 }
@@ -206,6 +220,7 @@ def figure_table(count: int) -> str:
         "unbounded": lambda: far_share(frame.distances(scene.means), masses),
         "haze": lambda: haze_share(opacities, masses, SimplifyConfig()),
         "duplicates": lambda: duplicate_share(scene.means, scene.sh0),
+        "clamping": lambda: mean_clamped(scene, masses),
     }
     simplifier = Simplifier(device="cpu")
     whole = fastest(lambda: simplifier.simplify(scene, 0.05), runs=3)

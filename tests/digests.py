@@ -96,6 +96,13 @@ def in_double() -> Iterator:
     yield cvtgs.Simplifier(device="cpu").simplify(scene.with_tensors(double, {}), 0.05)
 
 
+def darkened() -> Iterator[cvtgs.GaussianScene]:
+    scene = cvtgs.synthetic.scene("object", 20_000, sh_degree=1, seed=0)
+    dark = scene.with_tensors(sh0=scene.sh0 - 0.9)
+    for preset in FAST:
+        yield cvtgs.Simplifier(config=preset, device="cpu").simplify(dark, 0.05)
+
+
 CASES = {
     **{f"scene {kind}": partial(lambda kind: iter([make(kind)]), kind) for kind in KINDS},
     **{
@@ -120,6 +127,7 @@ CASES = {
     "damaged rows": damaged,
     "tagged mip": tagged,
     "float64": in_double,
+    "colours below zero": darkened,
 }
 
 

@@ -177,6 +177,7 @@ def group_and_merge(
             partition,
             config.merge,
             areas=analysis.areas,
+            clamping=analysis.plan.clamping.active,
             with_network=with_network,
             on_cells=advance,
         )
@@ -199,6 +200,7 @@ def merge_and_inflate(
     config: MergeConfig,
     *,
     areas: Float[Tensor, "n"],
+    clamping: bool,
     with_network: bool,
     on_cells: Callable[[int], None] = lambda done: None,
 ) -> Merged:
@@ -209,13 +211,16 @@ def merge_and_inflate(
         partition: Rows of every cell.
         config: Settings of the merge.
         areas: Mean projected areas of the Gaussians.
+        clamping: Whether merged colours make up for members with colours below zero.
         with_network: Whether a network needs the neighbours.
         on_cells: Called with the number of finished cells.
 
     Returns:
         One Gaussian per cell.
     """
-    merged, shown = merge_members(scene, partition, config, areas=areas, on_cells=on_cells)
+    merged, shown = merge_members(
+        scene, partition, config, areas=areas, clamping=clamping, on_cells=on_cells
+    )
     near = neighbor_count(config, with_network=with_network)
     neighbors = cvt.nearest_neighbors(merged.means, near)
     return Merged(shape_merged(merged, shown, neighbors, config), shown, neighbors)
@@ -227,10 +232,13 @@ def merge_members(
     config: MergeConfig,
     *,
     areas: Float[Tensor, "n"],
+    clamping: bool,
     on_cells: Callable[[int], None] = lambda done: None,
 ) -> tuple[GaussianScene, cells.Partition]:
     """Merge every cell by its members alone; also return the members each result stands for."""
-    merged = cells.merge_cells(scene, partition, config=config, on_cells=on_cells)
+    merged = cells.merge_cells(
+        scene, partition, config=config, clamping=clamping, on_cells=on_cells
+    )
     if not config.representatives:
         return merged, partition
     return cells.keep_representatives(scene, merged, partition, areas=areas)

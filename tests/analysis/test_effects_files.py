@@ -121,7 +121,7 @@ def test_info_lists_every_effect_with_its_evidence(source, capsys):
         (
             "fog=on",
             "effects.fog: is not a known setting; there are sh, mip, unbounded, haze, flat, "
-            "duplicates, extras, visibility.",
+            "duplicates, clamping, extras, visibility.",
         ),
         ("sh=4", "effects.sh: input should be 'auto', 'on', 'off', 0, 1, 2 or 3, found '4'."),
         ("mip=maybe", "effects.mip: input should be 'auto', 'on' or 'off', found 'maybe'."),

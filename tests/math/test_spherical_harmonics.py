@@ -8,7 +8,14 @@ import torch
 
 import oracles
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.math.spherical_harmonics import SH_C0, degree_of, evaluate, rest_basis
+from cvtgs.math.spherical_harmonics import (
+    SH_C0,
+    clamped_colors,
+    clamped_parts,
+    degree_of,
+    evaluate,
+    rest_basis,
+)
 
 
 def random_directions(count: int) -> torch.Tensor:
@@ -88,3 +95,38 @@ def test_other_degrees_are_errors(degree):
 def test_gradients():
     directions = random_directions(3).requires_grad_()
     assert torch.autograd.gradcheck(lambda d: rest_basis(d, 3), (directions,))
+
+
+def random_colors(count: int, degree: int, mean: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return coefficients of colours about a mean, most of them on both sides of it."""
+    g = torch.Generator().manual_seed(degree)
+    sh = torch.randn(count, (degree + 1) ** 2, 3, generator=g, dtype=torch.float64) * 0.3
+    sh[:, 0] = (mean - 0.5) / SH_C0
+    return sh[:, :1], sh[:, 1:]
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_colours_wholly_below_zero_are_their_own_clamped_part(degree):
+    sh0, rest = random_colors(20000, degree, mean=-9.0)
+    parts = clamped_parts(sh0, rest)
+    torch.testing.assert_close(parts[:, :1], -(sh0 + 0.5 / SH_C0))
+    torch.testing.assert_close(parts[:, 1:], -rest)
+    assert not clamped_parts(-sh0, rest).any()
+    assert not clamped_colors(-sh0, rest).any()
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_clamped_parts_are_the_best_fit_to_what_images_show(degree):
+    """Of the difference between shown and signed colours, in directions of another kind."""
+    sh0, rest = random_colors(50, degree, mean=0.0)
+    directions = random_directions(3000)
+    basis = torch.cat([torch.full((3000, 1), SH_C0), rest_basis(directions, degree)], dim=1)
+    signed = 0.5 + torch.einsum("dk,nkc->ndc", basis, torch.cat([sh0, rest], dim=1))
+    missing = signed.clamp_min(0) - signed
+    best = torch.linalg.lstsq(basis, missing.transpose(0, 1).flatten(1)).solution
+    found = torch.einsum("dk,nkc->ndc", basis, clamped_parts(sh0, rest))
+    wanted = (basis @ best).unflatten(1, (50, 3)).transpose(0, 1)
+    assert (found - wanted).square().mean() < 0.02 * missing.square().mean()
+    assert (found - missing).square().mean() < 1.2 * (wanted - missing).square().mean()
+    average = clamped_colors(sh0, rest).mean(dim=0)
+    torch.testing.assert_close(average, missing.mean(dim=1), atol=0.01, rtol=0.05)

@@ -13,7 +13,7 @@ from cvtgs.config.base import Record
 from cvtgs.devices import chunk_length, row_chunks
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import MIN_ALPHA, divide, opacity_from_logit
-from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
+from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0, clamped_colors
 from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 from cvtgs.tags import ANTIALIASED, TWO_SCALES
 
@@ -28,17 +28,15 @@ FULLY_UNBOUNDED_SHARE = 0.1
 DUPLICATE_SHARE = 0.01
 """With more than this share of duplicates, it pays to search only once per position."""
 
+CLAMPED = 2e-3  # where less of full brightness is below zero, up to 0.02 dB can be gained
 UNBOUNDED_DISTANCE = 3.0  # distance beyond which Gaussians count as far away, in robust radii
-
 SAMPLE = 1 << 14
 """Approximate size of the sample, evenly spaced in the rows, that is examined first."""
 
 HASHED = 1 << 12  # smallest expected size of the sample in which duplicates are counted
-
 CHUNK = 1 << 14
 
 _FACTORS = (0x1E3779B97F4A7C15, 0x3F58476D1CE4E5B9, 0x14D049BB133111EB)  # odd, of 62 bits at most
-
 LEAST_CONTRAST = 1e-6  # floor of the contrast, for scenes of a single colour
 
 
@@ -91,6 +89,7 @@ class EffectPlan(Record):
         haze: Faint Gaussians hold mass: only the faintest are dropped.
         flat: Gaussians have two scales (2DGS), and none gets a third.
         duplicates: Gaussians share positions: the nearest site is searched once per position.
+        clamping: Colours are below zero, where images show black: merged ones make up for it.
         extras: Columns beyond the standard ones are carried along.
         visibility: Images measure the contribution of each Gaussian.
     """
@@ -101,6 +100,7 @@ class EffectPlan(Record):
     haze: Effect
     flat: Effect
     duplicates: Effect
+    clamping: Effect
     extras: Effect
     visibility: Effect
 
@@ -138,19 +138,19 @@ def plan_effects(
     config = config or SimplifyConfig()
     choices = config.effects
     apparent = masses if apparent_masses is None else apparent_masses
-    for name, values in (
-        ("masses", masses),
-        ("apparent_masses", apparent),
-        ("distances", distances),
-    ):
+    given = {"masses": masses, "apparent_masses": apparent, "distances": distances}
+    for name, values in given.items():
         if values.shape != scene.logit_opacities.shape:
             raise InvalidArgumentError(f"{name} must be one number for each Gaussian of the scene.")
     shares = [
         far_share(distances, masses * drawn_rows(scene.opacities)),
         haze_share(scene.opacities, apparent, config),
         duplicate_share(scene.means, scene.sh0),
+        mean_clamped(scene, masses),
     ]
-    far, hazy, duplicates = torch.stack(shares).tolist()  # one synchronization with the device
+    far, hazy, duplicates, clamped = torch.stack(
+        shares
+    ).tolist()  # one synchronization with the device
     above = (far - UNBOUNDED_SHARE) / (FULLY_UNBOUNDED_SHARE - UNBOUNDED_SHARE)
     beyond = f"of the mass is beyond {UNBOUNDED_DISTANCE:g} robust radii"
     unbounded = _by_share(far, choices.unbounded, UNBOUNDED_SHARE, beyond)
@@ -172,6 +172,9 @@ def plan_effects(
             choices.duplicates,
             DUPLICATE_SHARE,
             "of the Gaussians coincide with others of the same colour",
+        ),
+        clamping=_by_share(
+            clamped, choices.clamping, CLAMPED, "of full brightness, on average, is below zero"
         ),
         extras=_if_present(
             len(scene.extras), choices.extras, "there are columns beyond the standard ones"
@@ -303,6 +306,14 @@ def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) ->
     place, color = means[sample], sh0[sample, 0]
     same = (place[1:] == place[:-1]).all(dim=1) & (color[1:] == color[:-1]).all(dim=1)
     return same.sum().double() / max(1, len(sample))
+
+
+def mean_clamped(scene: GaussianScene, masses: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """Return how far colours are below zero, as a mean over a sample, by mass, and directions."""
+    step = max(1, len(masses) // (SAMPLE >> 2))
+    clamped = clamped_colors(scene.sh0[::step], scene.shN[::step]).mean(dim=(0, 2))
+    sample = masses[::step].double()
+    return divide((sample * clamped).sum(), sample.sum())
 
 
 def _hash(means: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:

@@ -23,6 +23,7 @@ from cvtgs.math.segments import (
     take_columns,
     true_rows,
 )
+from cvtgs.math.spherical_harmonics import clamped_parts
 from cvtgs.scene import GaussianScene
 
 CHUNK_MEMBERS = 1 << 15
@@ -43,6 +44,7 @@ def merge_cells(
     partition: Partition,
     *,
     config: MergeConfig,
+    clamping: bool = False,
     on_cells: Callable[[int], None] = lambda done: None,
 ) -> GaussianScene:
     """Merge every cell into one Gaussian.
@@ -56,6 +58,8 @@ def merge_cells(
         scene: The Gaussians, with valid rows.
         partition: Row numbers of every cell.
         config: Weights and opacity rule.
+        clamping: Whether mean colours are raised where members have colours below zero, which
+            images show as zero.
         on_cells: Called with the number of finished cells.
 
     Returns:
@@ -94,9 +98,12 @@ def merge_cells(
                 merged_depth(members, areas, rule=config.opacity, antialiased=scene.antialiased)
             ),
         }
-        for name in ("sh0", "shN"):
-            values = getattr(scene, name).index_select(0, rows).double()
-            new[name] = segment_sum(values, offsets, weights)
+        colors = [tensor.index_select(0, rows).double() for tensor in (scene.sh0, scene.shN)]
+        new["sh0"], new["shN"] = (segment_sum(values, offsets, weights) for values in colors)
+        if clamping:
+            raised = segment_sum(clamped_parts(*colors), offsets, weights)
+            raised = raised - clamped_parts(new["sh0"], new["shN"])
+            new["sh0"], new["shN"] = new["sh0"] + raised[:, :1], new["shN"] + raised[:, 1:]
         for name, values in new.items():
             tensors[name][of_cells] = values.to(tensors[name].dtype)
         if extras:

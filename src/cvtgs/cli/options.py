@@ -126,8 +126,8 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     "--effects": {
         "metavar": "NAME=VALUE,...",
         "help": "effects to force, for example sh=1,mip=off, instead of choosing them by the "
-        "scene: sh (0 to 3, on or off); mip, unbounded, haze, duplicates (on or off); flat, "
-        "extras, visibility (off); auto is the default of each",
+        "scene: sh (0 to 3, on or off); mip, unbounded, haze, duplicates, clamping (on or "
+        "off); flat, extras, visibility (off); auto is the default of each",
     },
     "--lpips": {
         "default": "auto",

@@ -47,6 +47,8 @@ class EffectsConfig(Section):
         haze: Whether faint Gaussians are kept by their mass; ``off`` drops all of them.
         flat: Whether a scene of Gaussians with two scales (2DGS) keeps two scales.
         duplicates: Whether Gaussians at exactly the same position share one search.
+        clamping: Whether merged colours make up for members with colours below zero, if there are
+            any: images show these as zero, so a plain mean of colours is darker than its members.
         extras: Whether columns beyond the standard ones are carried along.
         visibility: Whether images for contributions and matching are rendered if the preset asks
             for them; refinement has its own.
@@ -58,6 +60,7 @@ class EffectsConfig(Section):
     haze: Choice = "auto"
     flat: Less = "auto"
     duplicates: Choice = "auto"
+    clamping: Choice = "auto"
     extras: Less = "auto"
     visibility: Less = "auto"
 

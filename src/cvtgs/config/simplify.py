@@ -86,7 +86,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = _frozen(
             "refine": THINNED,
         },
         "paper": {
-            "effects": {"unbounded": "off", "duplicates": "off"},
+            "effects": {"unbounded": "off", "duplicates": "off", "clamping": "off"},
             "filter": {"min_opacity": 0.1, "max_mass_share": 1.0, "max_flyaway_share": 0.0},
             "cvt": {
                 "area_power": 0.0,

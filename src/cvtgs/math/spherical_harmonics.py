@@ -1,12 +1,16 @@
 """Real spherical harmonics in the order, scale and signs that 3DGS files use."""
 
 import math
+from functools import cache
 from itertools import pairwise
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
 from torch import Tensor
 
+from cvtgs.devices import row_chunks
 from cvtgs.errors import InvalidArgumentError
 
 SH_C0 = 0.5 / math.sqrt(math.pi)
@@ -29,6 +33,11 @@ SH_C3 = (
 )
 """The factors of the cubic functions, by rising rotational symmetry: of ``y (3xx - yy)``, ``xyz``
 (half of it of ``z (xx - yy)``), ``y (4zz - xx - yy)`` and ``z (2zz - 3xx - 3yy)``."""
+
+DIRECTIONS = 32
+"""Directions, spread evenly over the sphere, in which :func:`clamped_parts` looks at colours."""
+
+CHUNK = 1 << 13  # colours at a time, whose parts in all directions fit into a cache
 
 REST_COUNTS = (0, 3, 8, 15)  # coefficients per colour channel above the constant band, by degree
 _ROUNDING = 1e-12  # entries of a rotation of SH bands below this are set to zero
@@ -119,6 +128,77 @@ def evaluate(
     if degree > 0:
         colors = colors + (rest_basis(directions, degree)[:, :, None] * shN).sum(dim=1)
     return colors.clamp_min(0)
+
+
+def clamped_colors(
+    sh0: Float[Tensor, "n 1 3"],
+    shN: Float[Tensor, "n k 3"],  # noqa: N803 (the name that gsplat gives it)
+) -> Float[Tensor, "d n 3"]:
+    """Return how far colours are below zero, which images show as zero, in even directions.
+
+    Args:
+        sh0: Constant band.
+        shN: View-dependent bands.
+
+    Returns:
+        Parts below zero, at least 0, float64; d is :data:`DIRECTIONS`, or 1 without bands.
+
+    Raises:
+        InvalidArgumentError: ``shN`` has a number of coefficients that belongs to no degree.
+
+    Example:
+        >>> dark = torch.full((1, 1, 3), -0.75 / SH_C0)
+        >>> round(clamped_colors(dark, torch.zeros(1, 0, 3)).mean().item(), 6)
+        0.25
+    """
+    basis, _ = _even_basis(degree_of(shN.shape[1]))
+    columns = torch.cat([sh0, shN], dim=1).double().permute(1, 0, 2).flatten(1)
+    start = columns.new_full((), -0.5)
+    below = torch.addmm(start, torch.as_tensor(-basis, device=sh0.device), columns)
+    return below.clamp_min_(0).view(len(basis), len(sh0), 3)
+
+
+def clamped_parts(
+    sh0: Float[Tensor, "n 1 3"],
+    shN: Float[Tensor, "n k 3"],  # noqa: N803 (the name that gsplat gives it)
+) -> Float[Tensor, "n k_plus_1 3"]:
+    """Return coefficients of the parts of colours below zero, by least squares.
+
+    Args:
+        sh0: Constant band.
+        shN: View-dependent bands.
+
+    Returns:
+        Coefficients, float64, the constant band first; 0 for colours that are nowhere below zero.
+
+    Raises:
+        InvalidArgumentError: ``shN`` has a number of coefficients that belongs to no degree.
+
+    Example:
+        >>> dark = torch.full((1, 1, 3), -0.75 / SH_C0)
+        >>> round(SH_C0 * clamped_parts(dark, torch.zeros(1, 0, 3)).mean().item(), 6)
+        0.25
+    """
+    _, inverse = _even_basis(degree_of(shN.shape[1]))
+    fit = torch.as_tensor(inverse, device=sh0.device)
+    parts = [
+        (fit @ clamped_colors(sh0[rows], shN[rows]).flatten(1)).unflatten(1, (-1, 3))
+        for rows in row_chunks(len(sh0), CHUNK, sh0.device)
+    ]
+    return torch.cat(parts, dim=1).transpose(0, 1)
+
+
+@cache
+def _even_basis(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return all basis functions in even directions (a Fibonacci lattice), and their inverse."""
+    count = DIRECTIONS if degree else 1
+    steps = np.arange(count) + 0.5
+    angles, z = steps * math.pi * (3 - math.sqrt(5)), 1 - 2 * steps / count
+    radii = np.sqrt(1 - z * z)
+    points = np.stack([radii * np.cos(angles), radii * np.sin(angles), z], axis=1)
+    rest = rest_basis(torch.as_tensor(points, device="cpu"), degree).numpy()
+    basis = np.concatenate([np.full((count, 1), SH_C0), rest], axis=1)
+    return basis, np.linalg.pinv(basis)
 
 
 def rotated_rest(

@@ -54,7 +54,13 @@ def merge(job: Job, block: int) -> None:
         return
     found = read_cells(job, block)
     scene, partition = found.scene, found.partition
-    merged, shown = merge_members(scene, partition, job.config.merge, areas=scene.areas)
+    merged, shown = merge_members(
+        scene,
+        partition,
+        job.config.merge,
+        areas=scene.areas,
+        clamping=job.read_scan().plan.clamping.active,
+    )
     first = shown.order[shown.offsets[:-1]]
     more = {
         "sizes": shown.counts,
