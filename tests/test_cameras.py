@@ -238,6 +238,8 @@ def test_a_camera_may_look_along_its_up_direction():
         ((-0.1, 0, 1), False),
         ((8, 6, 2.1), True),
         ((0, 0, -1), False),
+        ((0, 0, 0.011), True),
+        ((0, 0, 0.009), False),  # nearer than the near plane, where renderers draw nothing
     ],
 )
 def test_whether_a_point_is_in_an_image(point, is_seen):

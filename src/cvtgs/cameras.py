@@ -15,6 +15,7 @@ from cvtgs.counts import checked_whole, spread_rows, whole_number
 from cvtgs.devices import usable_device, without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.frames import unit_vectors
+from cvtgs.math.parameters import NEAR_PLANE
 from cvtgs.text import shown
 
 
@@ -287,17 +288,17 @@ class Cameras:
         """Check whether any point lies within any of the images.
 
         Args:
-            points: ``(n, 3)`` positions in the units of the cameras.
+            points: Positions in the units of the cameras.
 
         Returns:
-            Whether a point is in front of a camera and within its image.
+            Whether one is at least 0.01 before a camera (the near plane) and within its image.
 
         Raises:
             InvalidArgumentError: ``points`` is no tensor of floats of this shape.
         """
         for view, intrinsics in zip(self.viewmats.to(points), self.Ks.to(points), strict=True):
             x, y, depth = intrinsics @ (view[:3, :3] @ points.T + view[:3, 3:])
-            inside = (depth > 0) & (x >= 0) & (x <= self.width * depth)
+            inside = (depth >= NEAR_PLANE) & (x >= 0) & (x <= self.width * depth)
             if bool((inside & (y >= 0) & (y <= self.height * depth)).any()):
                 return True
         return False
@@ -314,8 +315,7 @@ class Cameras:
         Raises:
             InvalidArgumentError: The count is no whole number above 0.
         """
-        count = checked_whole(count, "count")
-        return self.select(spread_rows(len(self), count))
+        return self.select(spread_rows(len(self), checked_whole(count, "count")))
 
 
 def join_cameras(parts: Sequence[Cameras]) -> Cameras:

@@ -185,17 +185,21 @@ def standardized(scene: GaussianScene) -> GaussianScene:
     return scene.with_tensors(tensors)
 
 
-def lost_step(scene: GaussianScene) -> float:
+def lost_step(scene: GaussianScene, *, in_file: bool = False) -> float:
     """Return the step between float32 coordinates far from the origin; 0 where it is harmless.
 
-    It is harmless if it is small beside the median standard deviation of the Gaussians.
+    Scenes in float64 have none, but files store them as float32 (``in_file``).
     """
-    if len(scene) == 0 or scene.means.element_size() > 4:
+    if len(scene) == 0 or (scene.means.element_size() > 4 and not in_file):
         return 0.0
     far = float(scene.means.nanmedian(dim=0).values.abs().amax())
     if not _FAR <= far < math.inf:
         return 0.0
-    step = 2.0 ** (math.floor(math.log2(far)) - 23)
+    return coarse_step(scene, 2.0 ** (math.floor(math.log2(far)) - 23))
+
+
+def coarse_step(scene: GaussianScene, step: float) -> float:
+    """Return a step between coordinates; 0 if the median standard deviation is far larger."""
     typical = math.exp(float(scene.log_scales.amax(dim=1).nanmedian().clamp(max=MAX_LOG_SCALE)))
     return step if step > _HARMLESS * typical else 0.0
 

@@ -10,6 +10,7 @@ from cvtgs import GaussianScene, load, save
 from cvtgs.boxes import Box, Sphere
 from cvtgs.cli.main import main
 from cvtgs.edit import Motion, crop, drop_faint, drop_large, merge, move
+from cvtgs.io import losses
 from format_cases import storable_scene
 from scenes import random_scene, same_bits
 
@@ -57,7 +58,7 @@ def test_dropped_gaussians_and_bands_are_printed(
     inside = crop(merge([scene, scene]), [Sphere(center=(0.0, 0.0, 0.0), radius=2.0)])
     printed = " ".join(capsys.readouterr().out.split())
     assert (
-        f"Lost: {400 - len(inside)} Gaussians (outside --crop-box and --crop-sphere); "
+        f"Lost: {400 - len(inside)} Gaussians (outside --crop-sphere); "
         f"{len(inside) - len(found)} Gaussians (below --min-opacity); SH bands above degree 0 "
         f"(--sh-degree)."
     ) in printed
@@ -92,6 +93,8 @@ def test_edits_use_the_axes_of_a_ply(tmp_path: Path, scene: GaussianScene) -> No
             "a motion must not shrink all coordinates below 1.18e-38, the",
         ),
         (["--rotate", "90"], "--rotate must be three numbers x,y,z, degrees about each axis, fou"),
+        (["--rotate", ""], "--rotate must be three numbers x,y,z, degrees about each axis, found"),
+        (["--translate", ""], "--translate must be three numbers x,y,z, found ''"),
         (["--translate", "nan,0,0"], "--translate must be three numbers x,y,z, found 'nan,0,0'"),
         (["--merge", "missing.ply"], "missing.ply: the file to read must exist, found none."),
         (
@@ -164,3 +167,40 @@ def test_lost_digits_of_moved_positions_are_printed(
     assert "Lost: digits of positions (steps of 0.25 so far from the origin)." in printed
     converted(tmp_path, "--scale", "1e8")
     assert "Lost: nothing." in capsys.readouterr().out
+
+
+def test_the_steps_of_a_spz_far_from_the_origin_are_printed(
+    tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Coordinates of 24 bits are coarser than float32 there, and only their steps are printed."""
+    source, target = tmp_path / "in.ply", tmp_path / "far.spz"
+    save(scene.with_sh_degree(0), source)
+    assert main(["convert", str(source), str(target), "--translate=4500000,0,0"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Lost: digits of positions (steps of 1 so far from the origin)" in printed
+    assert printed.count("digits of positions") == 1
+    assert load(target).means[:, 0].unique().numel() < len(scene) / 2
+    assert main(["convert", str(source), str(tmp_path / "near.spz")]) == 0
+    assert "digits of positions" not in capsys.readouterr().out
+
+
+def test_double_precision_far_from_the_origin_is_lost_in_steps() -> None:
+    scene = storable_scene(50, degree=0)
+    double = scene.with_tensors(**{k: v.double() for k, v in scene.tensors().items()})
+    far = double.with_tensors(means=double.means + 4.5e6)
+    for suffix, step in ((".glb", "0.5"), (".splat", "0.5"), (".spz", "1")):
+        lost = {*losses(far, suffix).dropped} - {*losses(double, suffix).dropped}
+        assert lost == {f"digits of positions (steps of {step} so far from the origin)"}
+
+
+def test_a_merged_scene_of_which_some_are_flat_loses_the_tag(
+    tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flat = replace(scene, comments=("SplatRenderMode: 2dgs",))
+    paths = [tmp_path / "flat.ply", tmp_path / "thick.ply"]
+    for one, path in zip((flat, scene), paths, strict=True):
+        save(one, path)
+    words = ["convert", str(paths[0]), str(tmp_path / "both.ply"), "--merge", str(paths[1])]
+    assert main(words) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Lost: the tag 'SplatRenderMode: 2dgs', since not all scenes have two sc" in printed

@@ -134,6 +134,14 @@ def test_demo_replaces_only_files_of_an_earlier_demo(tmp_path, capsys, name):
     assert len(list(tmp_path.iterdir())) == 1
 
 
+def test_demo_keeps_a_generated_scene_of_the_user(tmp_path, capsys):
+    mine = cvtgs.synthetic.scene("landscape", 50, seed=9)
+    cvtgs.save(mine, tmp_path / "full.ply")
+    assert main(["demo", "-o", str(tmp_path), "--count", "50"]) == 1
+    assert "earlier demo, found full.ply" in capsys.readouterr().err
+    assert len(cvtgs.load(tmp_path / "full.ply")) == 50
+
+
 @pytest.mark.parametrize("words", [["--effects", "sh=1"], ["--lod", "0"]])
 def test_options_of_scenes_are_no_matter_of_checkpoints(capsys, words):
     assert main(["info", "standard", *words]) == 1

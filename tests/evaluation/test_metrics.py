@@ -217,6 +217,15 @@ def test_gaussians_that_no_renderer_draws_are_not_seen() -> None:
     check_seen(scene.select([0]), camera, name="it")  # if nothing is drawn, all centres count
 
 
+def test_a_scene_nearer_than_the_near_plane_is_not_seen() -> None:
+    scene = random_scene(20)
+    scene = scene.with_tensors(means=scene.means * 1e-4 + torch.tensor([0.0, 0.0, 0.005]))
+    intrinsics = torch.tensor([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]])
+    camera = Cameras(viewmats=torch.eye(4)[None], Ks=intrinsics, width=16, height=16)
+    with pytest.raises(InvalidArgumentError, match="the cameras must see it, found nothing"):
+        check_seen(scene, camera, name="it")
+
+
 def test_alpha_is_clipped_before_it_is_compared() -> None:
     one, other = torch.tensor([[[1.5, -0.5, 0.25]]]), torch.tensor([[[1.0, 0.0, 0.5]]])
     assert alpha_error(one, other).item() == alpha_error(other, one).item() == pytest.approx(1 / 12)

@@ -19,10 +19,10 @@ from cvtgs.analysis.effects import (
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig, TessellationConfig
 from cvtgs.devices import row_chunks
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import InvalidArgumentError, warn
 from cvtgs.losses import SSIM_WINDOW
 from cvtgs.math.frames import RobustFrame, robust_frame
-from cvtgs.math.parameters import divide
+from cvtgs.math.parameters import NEAR_PLANE, divide
 from cvtgs.rendering import ObservedViews, contributions, observe
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
@@ -294,6 +294,12 @@ def measure_contributions(
     if float(rendered.sum()) > 0.0:
         share = config.visibility.mass_share
         apparent = measured_areas(apparent, opacities, rendered, share=share)
+    else:
+        warn(
+            "images of the scene show nothing, so they change nothing: Gaussians are too faint, or "
+            f"the scene is so small that they are nearer to cameras than {NEAR_PLANE} units, where "
+            "renderers draw nothing; scale it up."
+        )
     haze = plan_haze(float(haze_share(opacities, apparent * opacities, config)), config)
     plan = analysis.plan.model_copy(update={"haze": haze})
     return replace(analysis, apparent_areas=apparent, plan=plan, observed=observed)

@@ -29,7 +29,7 @@ from cvtgs.cli.options import (
 )
 from cvtgs.cli.paths import any_path
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, without_warnings
-from cvtgs.tags import described_tags
+from cvtgs.tags import TWO_SCALES, described_tags
 from cvtgs.text import counted, first_of, size_text
 
 if TYPE_CHECKING:
@@ -112,7 +112,8 @@ def read_edits(options: argparse.Namespace) -> list[tuple[str, Edit]]:
         x, y, z, radius = _numbers("--crop-sphere", text, 4)
         regions.append(Sphere(center=(x, y, z), radius=radius))
     if regions:
-        words = "outside --crop-box and --crop-sphere"
+        given = {"--crop-box": options.crop_box, "--crop-sphere": options.crop_sphere}
+        words = f"outside {' and '.join(name for name, texts in given.items() if texts)}"
         edits.append((words, lambda scene: edit.crop(scene, regions)))
     if options.min_opacity is not None:
         words = "below --min-opacity"
@@ -124,8 +125,11 @@ def read_edits(options: argparse.Namespace) -> list[tuple[str, Edit]]:
         scale = 1.0 if options.scale is None else options.scale
         if not 0 < scale < math.inf:
             raise InvalidArgumentError(f"--scale must be above 0 and finite, found {scale}.")
-        a, b, c = _numbers("--rotate", options.rotate or "0,0,0", 3)
-        x, y, z = _numbers("--translate", options.translate or "0,0,0", 3)
+        rotate, translate = (
+            "0,0,0" if text is None else text for text in (options.rotate, options.translate)
+        )
+        a, b, c = _numbers("--rotate", rotate, 3)
+        x, y, z = _numbers("--translate", translate, 3)
         motion = Motion.of_angles((a, b, c), scale=scale, shift=(x, y, z))
         edits.append(("moved", lambda scene: edit.move(scene, motion)))
     return edits
@@ -139,6 +143,7 @@ def edited(
     scene: "GaussianScene", edits: Iterable[tuple[str, Edit]]
 ) -> "tuple[GaussianScene, list[str]]":
     """Return the edited scene, and one phrase for each kind of lost data."""
+    from cvtgs.io.limits import LOST_DIGITS
     from cvtgs.validity import lost_step
 
     phrases = []
@@ -147,7 +152,7 @@ def edited(
         if len(scene) < len(before):
             phrases.append(f"{counted(len(before) - len(scene), 'Gaussian')} ({words})")
         elif (step := lost_step(scene)) > lost_step(before):
-            phrases.append(f"digits of positions (steps of {step:.3g} so far from the origin)")
+            phrases.append(f"{LOST_DIGITS} (steps of {step:.3g} so far from the origin)")
         if len(scene) == 0:
             raise InvalidArgumentError(
                 f"at least one Gaussian must be left to write, found none: {'; '.join(phrases)}."
@@ -320,6 +325,8 @@ def convert(options: argparse.Namespace) -> None:
 
 def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
     """Convert one scene, and report the data that is lost."""
+    from cvtgs.io.limits import LOST_DIGITS
+
     options = job.options
     axes = read_axes(options.axes)
     scenes = [
@@ -337,6 +344,8 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
         scene = scenes[0] if len(scenes) == 1 else cvtgs.edit.merge(scenes)
     left = sorted({name for one in scenes for name in one.extras} - set(scene.extras))
     scene, phrases = edited(scene, edits)
+    if any(one.has_two_scales for one in scenes) and not scene.has_two_scales:
+        phrases.append(f"the tag '{TWO_SCALES.text}', since not all scenes have two scales")
     if left:
         phrases.append(f"columns that not all scenes have ({first_of(left)})")
     if options.sh_degree is not None and options.sh_degree < scene.sh_degree:
@@ -344,6 +353,8 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
         phrases += [f"SH bands above degree {options.sh_degree} (--sh-degree)"]
     version: Literal[2, 3, 4] = options.spz_version or 3
     lost = cvtgs.io.losses(scene, options.output, spz_version=version)
+    if any(phrase.startswith(LOST_DIGITS) for phrase in lost.dropped):  # of edits and of the file
+        phrases = [phrase for phrase in phrases if not phrase.startswith(LOST_DIGITS)]
     if not (options.quiet or job.is_one_of_many):
         stream, files = sys.stdout, f"files like {options.output.name}"
         if job.to_stream:

@@ -9,7 +9,10 @@ from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 from cvtgs.tags import ANTIALIASED, TWO_SCALES
 from cvtgs.text import counted, first_of
-from cvtgs.validity import writable_rows
+from cvtgs.validity import coarse_step, lost_step, writable_rows
+
+SPZ_STEPS = 1 << 23
+"""Steps of the coordinates of a ``.spz`` on each side of the origin."""
 
 SCALE_RANGE = (-87.3, 88.7)  # logarithms of the scales that float32 holds with full precision
 
@@ -57,6 +60,8 @@ def _largest_spz_coordinate(scene: GaussianScene) -> float:
     return largest_coordinate(scene)
 
 
+LOST_DIGITS = "digits of positions"
+_USUAL_SPZ_STEP = 1 / 4096
 _SPZ_ROTATIONS = "rotations in steps of 1/723 per component"
 
 _SPZ = FormatLimits(  # of versions 3 and 4
@@ -69,7 +74,8 @@ _SPZ = FormatLimits(  # of versions 3 and 4
     },
     largest_coordinate=_largest_spz_coordinate,
     changed=(
-        "positions in steps of 1/4096 (finer in scenes below 8 units, coarser above 2,048)",
+        "positions in steps of 1/4096 (finer in scenes below 8 units, coarser beyond 2,048 units "
+        "from the origin)",
         "scales in steps of 6.4 %",
         _SPZ_ROTATIONS,
         "opacities in steps of 1/255",
@@ -196,10 +202,16 @@ def dropped_within(scene: GaussianScene, limits: FormatLimits) -> dict[str, int]
         count = int((~rows).sum())
         verbs = "is not finite or has" if count == 1 else "are not finite or have"
         dropped[f"{counted(count, 'Gaussian')} that {verbs} no rotation"] = 0
-    ranges = dict(limits.ranges)
+    ranges, step = dict(limits.ranges), 0.0
+    if scene.dtype == torch.float64:
+        step = lost_step(scene, in_file=True)
     if limits.largest_coordinate is not None:
         largest = limits.largest_coordinate(scene)
         ranges["means"] = (-largest, largest)
+        if largest / SPZ_STEPS > _USUAL_SPZ_STEP:
+            step = max(step, coarse_step(scene, largest / SPZ_STEPS))
+    if step > 0:
+        dropped[f"{LOST_DIGITS} (steps of {step:.3g} so far from the origin)"] = 0
     for name, (low, high) in ranges.items():
         held = REST_COUNTS[limits.sh_degree] if name == "shN" else None
         values = getattr(scene, name)[:, :held][rows]

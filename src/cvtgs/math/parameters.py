@@ -17,6 +17,7 @@ LOGIT_LIMIT = math.log((1.0 - OPACITY_MARGIN) / OPACITY_MARGIN)
 """The logit of the largest opacity, about 13.8."""
 
 MIN_ALPHA = 1 / 255  # Gaussians of lower alpha in a pixel are not drawn there
+NEAR_PLANE = 0.01  # Gaussians whose centre is at a smaller depth are not rendered; scene units
 EIGENVALUE_FLOOR = 1e-12  # floor of eigenvalues as a share of the largest one (for scales: 1e-6)
 
 AREA_EXPONENT = 1.6075

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError, MissingDependencyError, how_to_install
+from cvtgs.math.parameters import NEAR_PLANE
 from cvtgs.math.spherical_harmonics import REST_COUNTS, evaluate
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.rendering import torch_backend
@@ -25,7 +26,7 @@ from cvtgs.rendering.backends import (
     observe_in_two_passes,
     without_gradients,
 )
-from cvtgs.rendering.projection import DILATION, NEAR_PLANE, to_matrices
+from cvtgs.rendering.projection import DILATION, to_matrices
 from cvtgs.scene import GaussianScene
 
 TOGETHER = 1 << 22

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cvtgs.math.parameters import LOGIT_LIMIT, MIN_ALPHA
+from cvtgs.math.parameters import LOGIT_LIMIT, MIN_ALPHA, NEAR_PLANE
 from cvtgs.math.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
 from cvtgs.rendering.compiled import (
     Array,
@@ -16,7 +16,6 @@ from cvtgs.rendering.compiled import (
     prange,
     serial,
 )
-from cvtgs.rendering.projection import NEAR_PLANE
 
 CHUNK = 256  # Gaussians per step of a parallel loop, which share their scratch arrays
 LEAST = 1e-37  # smallest inverse of a variance, which float32 holds; that of huge Gaussians

@@ -17,7 +17,6 @@ from cvtgs.scene import GaussianScene
 
 # Constants of the 3DGS rasterizer (Kerbl et al. 2023, section 6 and their renderer).
 
-NEAR_PLANE = 0.01  # Gaussians whose centre is at a smaller depth are not rendered; scene units
 DILATION = 0.3  # variance added to every projected Gaussian, squared pixels
 
 FRUSTUM_MARGIN = 0.3
@@ -247,7 +246,7 @@ def _candidates(scene: GaussianScene, camera: Pinhole, beside: CameraTensors) ->
     radius = 3.34 * stretch * largest + 3.34 * camera.dilation**0.5
     quats = scene.quats.abs().amax(dim=1)
     keep: Tensor = torch.isfinite(largest) & torch.isfinite(quats) & (quats > 0)
-    keep &= (z >= NEAR_PLANE) & torch.isfinite(z)
+    keep &= (z >= parameters.NEAR_PLANE) & torch.isfinite(z)
     for way, focal, principal, size in zip(
         (x, y), camera.focal, camera.principal, camera.size, strict=True
     ):

@@ -15,6 +15,7 @@ from cvtgs.counts import whole_number
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.arrays import HALF_RANGE, Arrays, arrays_of, drop_largest, opacity_bytes, to_bytes
 from cvtgs.io.axes import AXES, SCENE_AXES, checked_axes
+from cvtgs.io.limits import SPZ_STEPS
 from cvtgs.io.spz.read import (
     ANTIALIASED_FLAG,
     AXES_EXTENSION,
@@ -30,7 +31,6 @@ from cvtgs.validity import writable_rows
 
 _USUAL_BITS = 12
 _MOST_BITS = 22
-_STEPS = 1 << 23
 _OUTLIERS = 0.001
 _CHUNK_ROWS = 1 << 18
 _ZSTD_LEVEL = 12
@@ -112,7 +112,7 @@ def _write_fourth(arrays: Arrays, header: SpzHeader, axes: int, file: BinaryIO) 
 
 def largest_coordinate(scene: GaussianScene) -> float:
     """Return the largest coordinate that a file of the scene can hold."""
-    return _STEPS / (1 << _fractional_bits(scene))
+    return SPZ_STEPS / (1 << _fractional_bits(scene))
 
 
 def _fractional_bits(scene: GaussianScene) -> int:
@@ -144,7 +144,7 @@ def _blocks(arrays: Arrays, header: SpzHeader) -> Iterator[Iterator[UInt8[np.nda
 
 
 def _means(means: Float[np.ndarray, "n 3"], bits: int) -> UInt8[np.ndarray, "n b"]:
-    steps = np.clip(np.rint(means * np.float32(2**bits)), -_STEPS, _STEPS - 1)
+    steps = np.clip(np.rint(means * np.float32(2**bits)), -SPZ_STEPS, SPZ_STEPS - 1)
     steps = steps.astype("<i4", order="C")
     return np.ascontiguousarray(steps.view(np.uint8).reshape(len(means), 3, 4)[:, :, :3])
 
