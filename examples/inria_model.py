@@ -23,7 +23,7 @@ def main() -> None:
     scene_file = cvtgs.io.scene_file(options.model)
     small = cvtgs.Simplifier().simplify(cvtgs.load(scene_file), options.rho)
     target = options.output / scene_file.relative_to(options.model)
-    target.parent.mkdir(parents=True)
+    target.parent.mkdir(parents=True, exist_ok=True)
     cvtgs.save(small, target)
     for name in ("cameras.json", "cfg_args", "input.ply", "exposure.json"):
         if (options.model / name).is_file():

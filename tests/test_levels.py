@@ -214,6 +214,7 @@ def test_the_command_writes_levels(scene, tmp_path, capsys):
     said = json.loads((tmp_path / "out" / "levels.json").read_text())
     assert [level["count"] for level in said["levels"]] == [300, 30]
     assert said["views"] == 2
+    assert (said["width"], said["height"]) == (32, 24)
     assert said["levels"][0]["psnr"] > said["levels"][1]["psnr"]
     assert "rho_0.01.ply" in capsys.readouterr().out
     assert main([*words, "--no-scores"]) == 1

@@ -87,6 +87,8 @@ class LevelsIndex(Record):
         source: File name of the full scene.
         source_count: Number of Gaussians of the full scene.
         views: Number of views that the scores are means over; 0 without scores.
+        width: Width of their images, pixels; 0 without scores.
+        height: Height of their images, pixels; 0 without scores.
         levels: The levels, the finest first.
     """
 
@@ -94,6 +96,8 @@ class LevelsIndex(Record):
     source: str
     source_count: int
     views: int = 0
+    width: int = 0
+    height: int = 0
     levels: tuple[LevelEntry, ...]
 
 
@@ -223,7 +227,8 @@ def add_scores(index: LevelsIndex, folder: Path, evaluation: Evaluation) -> Leve
     """Add scores to the index of levels, also on disk."""
     scores = {one.name: one for one in evaluation.scenes}
     levels = tuple(level.with_scores(scores[level.file]) for level in index.levels)
-    index = index.model_copy(update={"levels": levels, "views": len(evaluation.views)})
+    size = {"width": evaluation.width, "height": evaluation.height}
+    index = index.model_copy(update={"levels": levels, "views": len(evaluation.views), **size})
     _write_index(index, folder, overwrite=True)
     return index
 

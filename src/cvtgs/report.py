@@ -96,7 +96,7 @@ class CellStatistics(Record):
 
 
 class SimplifyReport(CellStatistics):
-    """Report of a simplification.
+    """Report of a simplification, with the statistics of :class:`CellStatistics`.
 
     Attributes:
         input_count: Number of input Gaussians, N.

@@ -132,6 +132,15 @@ def test_the_images_that_a_matching_is_scored_on_are_named(views, blocks, where)
     assert text in report_notes(report)
 
 
+def test_settings_that_are_not_used_are_mentioned(capsys, source):
+    words = ["--rho", "0.1", "--set", "visibility.size=64", "--set", "refine.size=64"]
+    text = simplified(capsys, source, *words, "--set", "seed=1")
+    assert "--set visibility.size refine.size had no effect: draft uses no such images." in text
+    words += ["--set", "visibility.views=2", "--set", "refine.steps=0"]
+    text = simplified(capsys, source, *words, "--overwrite")
+    assert "--set refine.size had no effect" in text
+
+
 def test_cameras_that_are_not_used_are_mentioned(capsys, source):
     cameras = write_cameras(source.with_name("views.json"))
     text = simplified(capsys, source, "--rho", "0.1", "--cameras", cameras)
@@ -231,7 +240,8 @@ def test_one_gaussian_is_no_plural(capsys, source):
     text = printed(capsys, "evaluate", one, again, *views)
     assert "against one.ply, 1 Gaussian: " in text
     text = printed(capsys, "levels", one, "-o", source.with_name("levels"), *views, "--rho", "1")
-    assert text.startswith("one.ply, 1 Gaussian: ")
+    assert text.startswith("1 view of 16 x 12 pixels, rendered by ")
+    assert " one.ply, 1 Gaussian: " in text
 
 
 def test_dropped_rows_are_counted_with_separators(capsys, source):

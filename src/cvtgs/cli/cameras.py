@@ -9,12 +9,13 @@ import cvtgs
 from cvtgs.cli.display import say
 from cvtgs.cli.options import add_options, read_axes
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.text import counted
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from cvtgs.cameras import Cameras
-    from cvtgs.evaluation import EvaluationSettings
+    from cvtgs.evaluation import Evaluation, EvaluationSettings
     from cvtgs.scene import GaussianScene
 
 Color = tuple[float, float, float]
@@ -25,8 +26,19 @@ COLORS: Mapping[str, Color] = {
     "white": (1.0, 1.0, 1.0),
 }
 AUTOMATIC_VIEWS = 8
+SCORED_SIZE = 640
+"""Longer side of scored images, pixels; shared so that all commands print the same scores."""
+
 _MOST_VIEWS = 10_000
 _MOST_SIZE = 1 << 14  # pixels; images of 4 : 3 take some gigabytes then
+
+
+def say_views(evaluation: "Evaluation") -> None:
+    """Print the number, size and renderer of the images that scores are means over."""
+    say(
+        f"{counted(len(evaluation.views), 'view')} "
+        f"of {evaluation.width} x {evaluation.height} pixels, rendered by {evaluation.backend}"
+    )
 
 
 def add_view_options(parser: argparse.ArgumentParser, *, size: int, **helps: str) -> None:

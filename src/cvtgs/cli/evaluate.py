@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import cvtgs
 from cvtgs.cli.cameras import (
+    SCORED_SIZE,
     add_view_options,
     background_color,
     check_view_options,
     choose_cameras,
     evaluation_settings,
     read_photographs,
+    say_views,
 )
 from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped, shortfall_note
 from cvtgs.cli.jobs import expanded
@@ -32,9 +34,6 @@ if TYPE_CHECKING:
 
 MOST_CAMERAS = 8
 """Maximum number of cameras that a page shows, and that ``tradeoff`` scores from, by default."""
-
-SCORED_SIZE = 640
-"""Longer side of scored images, pixels; shared so that all commands print the same scores."""
 
 ALPHA_MEANS = "alpha: mean |difference| of coverage; bias < 0: more of the background shows"
 
@@ -180,10 +179,7 @@ def evaluate(options: argparse.Namespace) -> None:
 
 
 def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
-    say(
-        f"{counted(len(evaluation.views), 'view')} "
-        f"of {evaluation.width} x {evaluation.height} pixels, rendered by {evaluation.backend}"
-    )
+    say_views(evaluation)
     say(f"against {evaluation.reference}, {counted(evaluation.reference_count, 'Gaussian')}:")
     _print_score_table(evaluation.scenes, sizes)
     say(ALPHA_MEANS)

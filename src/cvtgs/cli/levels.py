@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.cameras import (
+    SCORED_SIZE,
     add_view_options,
     check_view_options,
     choose_cameras,
     evaluation_settings,
+    say_views,
 )
 from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped, shortfall_note
 from cvtgs.cli.jobs import check_suffix
@@ -70,7 +72,7 @@ def add_levels(add_parser: AddParser) -> None:
     add_options(parser, "--viewer", "--trust-sizes", "--overwrite")
     add_view_options(
         parser,
-        size=400,
+        size=SCORED_SIZE,
         split="split of --cameras to score from (default: all of --cameras); if it is given, "
         "presets that use images are fitted to the split train",
         views="number of views to score from; with --cameras, N of them, spread evenly (default "
@@ -130,6 +132,8 @@ def levels(options: argparse.Namespace) -> None:
             evaluation = _score(options, scene, files, views, listener)
             index = cvtgs.levels.add_scores(index, options.output, evaluation)
     if not options.quiet:
+        if views is not None:
+            say_views(evaluation)
         _print_index(index)
         for level in made:
             if level.report.shortfall:

@@ -195,6 +195,10 @@ def _simplify_one(
         used = report.config
         if options.cameras is not None and not (has_target(options) or used.uses_images):
             notes.append(f"--cameras was not used: {used.preset} renders no images.")
+        if unused := _unused(settings, used):
+            notes.append(
+                f"--set {' '.join(unused)} had no effect: {used.preset} uses no such images."
+            )
     if options.report is not None:
         _write_report(options, report)
     searched = has_target(options)
@@ -217,6 +221,18 @@ def _simplify_one(
         f"{total:.2f} s",
         notes + report_notes(report),
     )
+
+
+def _unused(settings: Mapping[str, str], config: "SimplifyConfig") -> list[str]:
+    """Return the names of settings of images that a configuration does not render."""
+    switches = {"visibility.views", "refine.steps", "refine.seconds"}  # may have said so
+    rendered = {"visibility": config.uses_renders, "match": config.uses_renders}
+    rendered["refine"] = config.refine.enabled
+    return [
+        name
+        for name in settings
+        if not rendered.get(name.partition(".")[0], True) and name not in switches
+    ]
 
 
 def _simplify_in_memory(

@@ -243,5 +243,6 @@ def _print_levels(
         )
     if any(one.gaussians == 0 for one in levels):
         say_wrapped(
-            "Levels of 0 Gaussians are in no tile: the tree is less deep than there are levels."
+            "Levels of 0 Gaussians are skipped: the tree of tiles is less deep than there are "
+            "levels, since the tiles of a finer one are small enough."
         )

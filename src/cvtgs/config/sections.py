@@ -275,7 +275,7 @@ class RefineConfig(ImageSection):
     """The settings of a refinement; frozen, unknown keys are errors.
 
     Attributes:
-        steps: Maximum number of steps; 0 leaves the limit to ``seconds``.
+        steps: Maximum number of steps, before ``lengthening``; 0 leaves the limit to ``seconds``.
         images_per_step: Images of one step, whose losses are averaged. On a GPU, a step of four
             takes little more time than one of a single image.
         seconds: Maximum wall-clock seconds; 0 leaves the limit to ``steps``. With both 0, a
