@@ -6,6 +6,7 @@ blocks call the functions of each stage in the same order, block by block (``out
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -27,6 +28,7 @@ from cvtgs.grouping import (
     weigh_rows,
     with_importance,
 )
+from cvtgs.math.frames import RobustFrame
 from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import Net, correct_cells
 from cvtgs.report import CellStatistics, MatchReport
@@ -104,6 +106,10 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
     if target >= len(scene.means):
         return Reduced(standardized(scene) if target < total else with_finite_opacities(scene))
     used = drop_unused_bands(scene, analysis.plan)
+    used, origin = centered(used, analysis.frame)
+    if origin is not None:
+        frame = replace(analysis.frame, center=analysis.frame.center - origin)
+        analysis = replace(analysis, frame=frame)
     merged, partition, statistics = group_and_merge(
         used,
         analysis,
@@ -127,9 +133,27 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
                 pixel_size=analysis.frame.radius / config.merge.image_size,
                 on_cells=advance,
             )
+    if origin is not None:
+        small = moved_back(small, origin, scene, merged.partition)
     return Reduced(
         restore_columns(standardized(small), scene, analysis.plan), statistics, partition
     )
+
+
+def centered(
+    scene: GaussianScene, frame: RobustFrame
+) -> tuple[GaussianScene, Float[Tensor, "3"] | None]:
+    """Move a float32 scene to the origin if it is far from it, so that merging rounds less."""
+    origin = frame.far_origin(scene.means)
+    return (scene if origin is None else scene.with_tensors(means=scene.means - origin)), origin
+
+
+def moved_back(
+    small: GaussianScene, origin: Float[Tensor, "3"], scene: GaussianScene, shown: cells.Partition
+) -> GaussianScene:
+    """Move the results of cells back, those of a single member to its very position."""
+    rows, is_single = shown.order[shown.offsets[:-1]], (shown.counts == 1)[:, None]
+    return small.with_tensors(means=torch.where(is_single, scene.means[rows], small.means + origin))
 
 
 def group_and_merge(

@@ -11,6 +11,7 @@ from cvtgs.devices import row_chunks
 
 RADIUS_QUANTILE = 0.7  # the share of points within the radius of a frame
 CHUNK = 1 << 16  # points per chunk, to bound memory
+FAR = 1000.0  # distance from the origin, in radii, from which float32 positions are coarse
 BITS = 21  # bits per axis; three axes fill a 63-bit code
 
 _SPREAD = (
@@ -44,6 +45,20 @@ class RobustFrame:
             Positions in float64.
         """
         return (points.double() - self.center) / self.radius
+
+    def far_origin(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "3"] | None:
+        """Return the centre if float32 points lie so far from the origin that they are coarse.
+
+        Args:
+            points: Positions, scene units.
+
+        Returns:
+            The centre as float32; None for other points. Differences of points from it are exact,
+            but for a few that lie nearer to the origin.
+        """
+        if points.dtype != torch.float32 or float(self.center.abs().amax()) < FAR * self.radius:
+            return None
+        return self.center.to(points.dtype)
 
     def distances(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Return distances to the centre, in radii.

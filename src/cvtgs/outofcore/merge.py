@@ -20,7 +20,15 @@ from cvtgs.mergenet import correct_cells
 from cvtgs.outofcore.halo import bounding_box, halo_cells, other_blocks
 from cvtgs.outofcore.job import Job, Step
 from cvtgs.outofcore.rows import BlockRows, analysis_of, read_members, read_rows
-from cvtgs.pipeline import Reduced, merge_members, neighbor_count, reduce_scene, shape_merged
+from cvtgs.pipeline import (
+    Reduced,
+    centered,
+    merge_members,
+    moved_back,
+    neighbor_count,
+    reduce_scene,
+    shape_merged,
+)
 from cvtgs.progress import silent
 from cvtgs.report import CellStatistics, MatchReport, RefineReport
 from cvtgs.scene import GaussianScene
@@ -53,7 +61,8 @@ def merge(job: Job, block: int) -> None:
     if job.has("merged", block):
         return
     found = read_cells(job, block)
-    scene, partition = found.scene, found.partition
+    partition = found.partition
+    scene, _ = centered(found.scene, job.read_scan().frame)
     merged, shown = merge_members(
         scene,
         partition,
@@ -103,6 +112,7 @@ def correct(job: Job, block: int) -> None:
     if job.small_path(block).exists():
         return
     original, scene, _, visibility, partition = read_cells(job, block)
+    scene, origin = centered(scene, job.read_scan().frame)
     own = job.read("inflated", block)
     shown = partition.keep_only(own["representatives"])
     small, sizes = _with_halo(job, "inflated", block, own["remote"])
@@ -120,6 +130,8 @@ def correct(job: Job, block: int) -> None:
         )
     tensors = {name: values[: len(own["sizes"])] for name, values in small.tensors().items()}
     small = scene.with_tensors(tensors, under_prefix(EXTRA, own))
+    if origin is not None:
+        small = moved_back(small, origin, original, shown)
     scan = job.read_scan()
     is_whole = job.read_manifest().total == scan.row_count
     finish = validity.with_finite_opacities if is_whole else validity.standardized

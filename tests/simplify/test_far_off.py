@@ -1,0 +1,83 @@
+"""float32 scenes far from the origin: merged as at the origin, in one piece and in blocks."""
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs import GaussianScene, Simplifier
+from cvtgs.devices import one_thread
+from cvtgs.evaluation import EvaluationSettings
+from cvtgs.math.frames import robust_frame
+from cvtgs.outofcore import simplify_file
+from cvtgs.views import automatic_views
+from scenes import random_scene, same_bits
+
+SHIFT = torch.tensor([2.0**17, -(2.0**16), 3.0 * 2**16])
+"""Distances at which float32 positions have steps of 1/64."""
+
+
+@pytest.fixture(scope="module")
+def near() -> GaussianScene:
+    """A scene whose positions are multiples of these steps, so that a shift rounds nothing."""
+    scene = cvtgs.synthetic.scene("object", 6000, sh_degree=0, seed=1)
+    return scene.with_tensors(means=(scene.means * 64).round() / 64)
+
+
+@pytest.fixture(scope="module")
+def far(near: GaussianScene) -> GaussianScene:
+    return near.with_tensors(means=near.means + SHIFT)
+
+
+def psnr(near: GaussianScene, small: GaussianScene) -> float:
+    views = automatic_views(near, 4, width=200, height=150)
+    settings = EvaluationSettings(lpips="off")
+    return cvtgs.evaluate(near, {"small": small}, views, settings=settings).scenes[0].psnr.mean
+
+
+def moved_to(small: GaussianScene, shift: torch.Tensor) -> GaussianScene:
+    return small.with_tensors(means=small.means + shift)
+
+
+def test_a_far_scene_is_as_good_as_at_the_origin(near, far):
+    """Merged positions are rounded to steps of 1/64, once; both have these positions."""
+    small, report = Simplifier(device="cpu").run(far, 0.1)
+    wanted = moved_to(moved_to(cvtgs.simplify(near, 0.1, device="cpu"), SHIFT), -SHIFT)
+    assert psnr(near, moved_to(small, -SHIFT)) > psnr(near, wanted) - 0.1
+    there = set(map(tuple, far.means.tolist()))
+    kept = sum(position in there for position in map(tuple, small.means.tolist()))
+    assert kept >= report.single_member_cells > 0
+
+
+def test_blocks_of_a_far_scene(near, far, tmp_path):
+    cvtgs.save(far, tmp_path / "far.ply")
+    cvtgs.save(near, tmp_path / "near.ply")
+    simplify_file(tmp_path / "far.ply", tmp_path / "one.ply", 0.1, blocks=1)
+    with one_thread():
+        whole = cvtgs.simplify(far, 0.1, device="cpu")
+    assert same_bits(cvtgs.load(tmp_path / "one.ply"), whole)
+    scores = {}
+    for name, shift in (("near", SHIFT * 0), ("far", SHIFT)):
+        simplify_file(tmp_path / f"{name}.ply", tmp_path / f"4{name}.ply", 0.1, blocks=4)
+        small = moved_to(cvtgs.load(tmp_path / f"4{name}.ply"), SHIFT - shift)
+        scores[name] = psnr(near, moved_to(small, -SHIFT))
+    assert scores["far"] > scores["near"] - 0.1
+
+
+@pytest.mark.parametrize(("distance", "dtype", "moves"), [
+    (500.0, torch.float32, False), (5000.0, torch.float32, True), (5000.0, torch.float64, False),
+])  # fmt: skip
+def test_only_coarse_positions_are_centred(distance, dtype, moves):
+    means = random_scene(100, dtype=dtype).means
+    frame = robust_frame(means)
+    means = means + distance * frame.radius
+    frame = robust_frame(means)
+    origin = frame.far_origin(means)
+    assert (origin is not None) is moves
+    if origin is not None:
+        assert torch.equal((means - origin) + origin, means)
+
+
+def test_a_protected_region_stays_in_place(far):
+    keep = torch.arange(len(far)) < 20
+    small = Simplifier(device="cpu").simplify(far, 0.05, keep=keep)
+    assert same_bits(small[:20], far[:20])
