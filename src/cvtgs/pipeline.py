@@ -130,7 +130,7 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
                 merged.partition,
                 neighbors=merged.neighbors,
                 visibility=analysis.visibility,
-                pixel_size=analysis.frame.radius / config.merge.image_size,
+                pixel_size=analysis.frame.view_radius / config.merge.image_size,
                 on_cells=advance,
             )
     if origin is not None:

@@ -1,12 +1,20 @@
 """The robust frame, which a minority of outliers cannot move, and the Morton curve."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 import oracles
-from cvtgs.math.frames import BITS, RobustFrame, morton_order, robust_frame, unit_vectors
+from cvtgs.math.frames import (
+    BITS,
+    RobustFrame,
+    group_radius,
+    morton_order,
+    robust_frame,
+    unit_vectors,
+)
 
 UNIT = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
 
@@ -152,3 +160,21 @@ def test_neighbours_on_the_curve_are_near():
     step = torch.linalg.vector_norm(walked.diff(dim=0), dim=1).mean()
     before = torch.linalg.vector_norm(points.diff(dim=0), dim=1).mean()
     assert float(step) < 0.2 * float(before)
+
+
+def test_one_group_is_as_wide_as_the_scene_and_groups_far_apart_are_not():
+    points = torch.randn(4000, 3, generator=torch.Generator().manual_seed(0))
+    frame = robust_frame(points)
+    assert group_radius(points) > frame.radius
+    for count, distance in ((2, 50.0), (10, 1000.0)):
+        shifts = distance * torch.arange(count).repeat_interleave(4000 // count)
+        apart = points + shifts[:, None] * torch.tensor([1.0, 0.0, 0.0])
+        assert frame.radius < group_radius(apart) < 8 * frame.radius
+        far = replace(robust_frame(apart), group_radius=group_radius(apart))
+        assert far.view_radius == far.group_radius < 0.3 * far.radius
+    assert robust_frame(points).view_radius == frame.radius
+
+
+@pytest.mark.parametrize("points", [torch.zeros(600, 3), torch.rand(511, 3)])
+def test_few_or_coincident_points_have_no_groups(points):
+    assert group_radius(points) == math.inf

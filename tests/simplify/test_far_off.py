@@ -1,4 +1,4 @@
-"""float32 scenes far from the origin: merged as at the origin, in one piece and in blocks."""
+"""Scenes far from the origin, merged as at the origin, and groups far apart."""
 
 import pytest
 import torch
@@ -75,6 +75,19 @@ def test_only_coarse_positions_are_centred(distance, dtype, moves):
     assert (origin is not None) is moves
     if origin is not None:
         assert torch.equal((means - origin) + origin, means)
+
+
+@pytest.mark.parametrize("distance", [30.0, 1e4])
+def test_groups_far_apart_are_seen_from_near(near, distance):
+    """With the extent of the whole as that of a view, the network lost 4 to 7 dB."""
+    other = moved_to(near, torch.tensor([distance, 0.0, 0.0]))
+    both = cvtgs.concatenate([near, other])
+    corrected, plain = (
+        Simplifier(config=name, device="cpu").simplify(both, 0.1) for name in ("standard", "fast")
+    )
+    alone = psnr(near, cvtgs.simplify(near, 0.1, device="cpu"))
+    assert psnr(near, corrected) > psnr(near, plain) + 0.3
+    assert psnr(near, corrected) > alone - 1.5
 
 
 def test_a_protected_region_stays_in_place(far):

@@ -132,9 +132,12 @@ def test_turns_that_keep_the_axes(quat, degree, ckpt):
 @pytest.mark.parametrize("quat", [(0.9, 0.1, -0.3, 0.2), (0.1, 0.7, 0.2, -0.6)])
 @pytest.mark.parametrize("rho", [RATIO, 0.1], ids=["from a tessellation", "from Gaussians"])
 def test_any_turn_where_nothing_depends_on_the_axes(rho, quat, ckpt):
-    """Colour, contraction and perspective use robust radii about the median, visibility a grid."""
+    """Colour, contraction and perspective use robust radii about the median, visibility a grid.
+
+    Colours below zero are fitted in directions of a lattice, which keeps only turns of the axes.
+    """
     cvt = {"color": 0.0, "perspective": False, "hidden_share": 1.0}
-    others = {"effects": {"unbounded": "off"}, "allocation": {"view_color": 0.0}}
+    others = {"effects": {"unbounded": "off", "clamping": "off"}, "allocation": {"view_color": 0.0}}
     config = SimplifyConfig.from_mapping({"cvt": cvt, **others})
     scene = dominated_scene(SEEDS, TOTAL, 3)
     motion = {"quat": quat, "shift": (1.0, 2.0, 3.0), "scale": 10.0}

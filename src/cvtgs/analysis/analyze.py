@@ -21,7 +21,7 @@ from cvtgs.config import SimplifyConfig, TessellationConfig
 from cvtgs.devices import row_chunks
 from cvtgs.errors import InvalidArgumentError, warn
 from cvtgs.losses import SSIM_WINDOW
-from cvtgs.math.frames import RobustFrame, robust_frame
+from cvtgs.math.frames import RobustFrame, group_radius, robust_frame
 from cvtgs.math.parameters import NEAR_PLANE, divide
 from cvtgs.rendering import ObservedViews, contributions, observe
 from cvtgs.scene import GaussianScene
@@ -137,7 +137,8 @@ def analyze(
 
 def frame_of(means: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"]) -> RobustFrame:
     """Return the robust frame of the Gaussians that are drawn at all; of all if none is."""
-    return robust_frame(means[drawn_rows(opacities)])
+    drawn = means[drawn_rows(opacities)]
+    return replace(robust_frame(drawn), group_radius=group_radius(drawn))
 
 
 def apparent_areas(

@@ -13,7 +13,7 @@ from cvtgs.config.base import Record
 from cvtgs.devices import chunk_length, row_chunks
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import MIN_ALPHA, divide, opacity_from_logit
-from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0, clamped_colors
+from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0, clamped_parts
 from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 from cvtgs.tags import ANTIALIASED, TWO_SCALES
 
@@ -311,7 +311,7 @@ def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) ->
 def mean_clamped(scene: GaussianScene, masses: Float[Tensor, "n"]) -> Float[Tensor, ""]:
     """Return how far colours are below zero, as a mean over a sample, by mass, and directions."""
     step = max(1, len(masses) // (SAMPLE >> 2))
-    clamped = clamped_colors(scene.sh0[::step], scene.shN[::step]).mean(dim=(0, 2))
+    clamped = SH_C0 * clamped_parts(scene.sh0[::step], scene.shN[::step])[:, 0].mean(dim=1)
     sample = masses[::step].double()
     return divide((sample * clamped).sum(), sample.sum())
 

@@ -2,7 +2,7 @@
 
 import math
 from functools import cache
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import torch
@@ -34,10 +34,7 @@ SH_C3 = (
 """The factors of the cubic functions, by rising rotational symmetry: of ``y (3xx - yy)``, ``xyz``
 (half of it of ``z (xx - yy)``), ``y (4zz - xx - yy)`` and ``z (2zz - 3xx - 3yy)``."""
 
-DIRECTIONS = 32
-"""Directions, spread evenly over the sphere, in which :func:`clamped_parts` looks at colours."""
-
-CHUNK = 1 << 13  # colours at a time, whose parts in all directions fit into a cache
+CHUNK = 1 << 13  # colours at a time, whose values in all directions fit into a cache
 
 REST_COUNTS = (0, 3, 8, 15)  # coefficients per colour channel above the constant band, by degree
 _ROUNDING = 1e-12  # entries of a rotation of SH bands below this are set to zero
@@ -130,39 +127,14 @@ def evaluate(
     return colors.clamp_min(0)
 
 
-def clamped_colors(
-    sh0: Float[Tensor, "n 1 3"],
-    shN: Float[Tensor, "n k 3"],  # noqa: N803 (the name that gsplat gives it)
-) -> Float[Tensor, "d n 3"]:
-    """Return how far colours are below zero, which images show as zero, in even directions.
-
-    Args:
-        sh0: Constant band.
-        shN: View-dependent bands.
-
-    Returns:
-        Parts below zero, at least 0, float64; d is :data:`DIRECTIONS`, or 1 without bands.
-
-    Raises:
-        InvalidArgumentError: ``shN`` has a number of coefficients that belongs to no degree.
-
-    Example:
-        >>> dark = torch.full((1, 1, 3), -0.75 / SH_C0)
-        >>> round(clamped_colors(dark, torch.zeros(1, 0, 3)).mean().item(), 6)
-        0.25
-    """
-    basis, _ = _even_basis(degree_of(shN.shape[1]))
-    columns = torch.cat([sh0, shN], dim=1).double().permute(1, 0, 2).flatten(1)
-    start = columns.new_full((), -0.5)
-    below = torch.addmm(start, torch.as_tensor(-basis, device=sh0.device), columns)
-    return below.clamp_min_(0).view(len(basis), len(sh0), 3)
-
-
 def clamped_parts(
     sh0: Float[Tensor, "n 1 3"],
     shN: Float[Tensor, "n k 3"],  # noqa: N803 (the name that gsplat gives it)
 ) -> Float[Tensor, "n k_plus_1 3"]:
-    """Return coefficients of the parts of colours below zero, by least squares.
+    """Return coefficients of the parts of colours below zero, which images show as zero.
+
+    They are the best fit, by least squares, in 26 directions: a cubature that is exact for the
+    products of the basis functions (Lebedev 1976), and that no turn between axes changes.
 
     Args:
         sh0: Constant band.
@@ -179,26 +151,28 @@ def clamped_parts(
         >>> round(SH_C0 * clamped_parts(dark, torch.zeros(1, 0, 3)).mean().item(), 6)
         0.25
     """
-    _, inverse = _even_basis(degree_of(shN.shape[1]))
-    fit = torch.as_tensor(inverse, device=sh0.device)
-    parts = [
-        (fit @ clamped_colors(sh0[rows], shN[rows]).flatten(1)).unflatten(1, (-1, 3))
-        for rows in row_chunks(len(sh0), CHUNK, sh0.device)
-    ]
+    basis, fit = (
+        torch.as_tensor(matrix, device=sh0.device) for matrix in _fit(degree_of(shN.shape[1]))
+    )
+    offset, parts = basis.new_full((), -0.5), []
+    for rows in row_chunks(len(sh0), CHUNK, sh0.device):
+        columns = torch.cat([sh0[rows], shN[rows]], dim=1).double().permute(1, 0, 2).flatten(1)
+        below = torch.addmm(offset, -basis, columns).clamp_min_(0)
+        parts.append((fit @ below).view(len(fit), -1, 3))
     return torch.cat(parts, dim=1).transpose(0, 1)
 
 
 @cache
-def _even_basis(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return all basis functions in even directions (a Fibonacci lattice), and their inverse."""
-    count = DIRECTIONS if degree else 1
-    steps = np.arange(count) + 0.5
-    angles, z = steps * math.pi * (3 - math.sqrt(5)), 1 - 2 * steps / count
-    radii = np.sqrt(1 - z * z)
-    points = np.stack([radii * np.cos(angles), radii * np.sin(angles), z], axis=1)
-    rest = rest_basis(torch.as_tensor(points, device="cpu"), degree).numpy()
-    basis = np.concatenate([np.full((count, 1), SH_C0), rest], axis=1)
-    return basis, np.linalg.pinv(basis)
+def _fit(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the basis functions in directions to the neighbours in a lattice, and the fit."""
+    places = [place for place in product((0, 1, -1), repeat=3) if any(place)]
+    shares = [(1 / 21, 4 / 105, 9 / 280)[sum(map(abs, place)) - 1] for place in places]
+    if degree == 0:
+        places, shares = places[:1], [1.0]
+    points = torch.tensor(places, dtype=torch.float64, device="cpu")
+    rest = rest_basis(points / torch.linalg.vector_norm(points, dim=1, keepdim=True), degree)
+    basis = np.concatenate([np.full((len(places), 1), SH_C0), rest.numpy()], axis=1)
+    return basis, 4 * math.pi * np.array(shares) * basis.T
 
 
 def rotated_rest(

@@ -125,7 +125,7 @@ def correct(job: Job, block: int) -> None:
             shown,
             neighbors=own["neighbors"],
             visibility=visibility,
-            pixel_size=job.read_scan().frame.radius / job.config.merge.image_size,
+            pixel_size=job.read_scan().frame.view_radius / job.config.merge.image_size,
             sizes=sizes,
         )
     tensors = {name: values[: len(own["sizes"])] for name, values in small.tensors().items()}

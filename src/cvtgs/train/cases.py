@@ -40,7 +40,7 @@ class MergedScene(NamedTuple):
     partition: Partition
     neighbors: Int[Tensor, "m k"]
     visibility: Float[Tensor, "n"]
-    radius: float  # of the robust frame of the scene
+    radius: float  # of what one view of the scene shows
 
 
 def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> MergedScene:
@@ -56,7 +56,7 @@ def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> Me
     valid = drop_unused_bands(valid, analysis.plan)
     clock = StageClock(silent, valid.device)
     merged = group_and_merge(valid, analysis, target, config, with_network=True, clock=clock)[0]
-    return MergedScene(valid, *merged, analysis.visibility, analysis.frame.radius)
+    return MergedScene(valid, *merged, analysis.visibility, analysis.frame.view_radius)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
