@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+import torch
 
 import cvtgs
 from cvtgs.cli import demo
@@ -132,6 +133,18 @@ def test_demo_replaces_only_files_of_an_earlier_demo(tmp_path, capsys, name):
     assert f"a new folder or that of an earlier demo, found {name}" in capsys.readouterr().err
     assert (tmp_path / name).read_text() == "mine"
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_info_tells_coordinates_far_from_the_origin_apart(tmp_path, capsys):
+    scene = cvtgs.synthetic.scene("object", 500, seed=0)
+    double = {name: tensor.double() for name, tensor in scene.tensors().items()}
+    means = double.pop("means") + torch.tensor([5e6, 0.0, -3e5])
+    cvtgs.save(scene.with_tensors(means=means, **double), tmp_path / "map.ply")
+    assert main(["info", str(tmp_path / "map.ply")]) == 0
+    text = capsys.readouterr().out.split("bounds")[1].splitlines()[0]
+    low, high = (list(map(float, part.strip(" ()").split(","))) for part in text.split(" to "))
+    for found, wanted in ((low, means.amin(dim=0)), (high, means.amax(dim=0))):
+        assert found == pytest.approx(wanted.tolist(), abs=0.002)
 
 
 def test_demo_keeps_a_generated_scene_of_the_user(tmp_path, capsys):

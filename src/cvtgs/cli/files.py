@@ -232,11 +232,13 @@ def _rows(facts: "SceneInfo") -> list[tuple[str, str]]:
     from cvtgs.info import HEAVIEST, QUANTILES
 
     invalid = ", ".join(f"{name} {number:,}" for name, number in facts.invalid_rows.items())
+    step = facts.robust_radius / 1000
+    center = _vector(facts.robust_center, step=step)
     rows = [
         ("Gaussians", f"{facts.count:,}"),
         ("SH degree", f"{facts.sh_degree}"),
-        ("bounds", f"{_vector(facts.bounds[0])} to {_vector(facts.bounds[1])}"),
-        ("robust radius", f"{facts.robust_radius:.4g} around {_vector(facts.robust_center)}"),
+        ("bounds", " to ".join(_vector(corner, step=step) for corner in facts.bounds)),
+        ("robust radius", f"{facts.robust_radius:.4g} around {center}"),
         (
             "opacity at",
             "   ".join(
@@ -281,8 +283,11 @@ def _effect_cells(effect: "Effect") -> tuple[str, str, str]:
     return state + (", by setting" if effect.forced else ""), figures, effect.meaning
 
 
-def _vector(values: tuple[float, ...]) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
+def _vector(values: tuple[float, ...], *, step: float) -> str:
+    """Write coordinates with four digits, or more far from the origin, to tell steps apart."""
+    far = max(map(abs, values))
+    digits = 4 if not 0 < step < far < math.inf else max(4, 1 + round(math.log10(far / step)))
+    return "(" + ", ".join(f"{value:.{min(digits, 17)}g}" for value in values) + ")"
 
 
 def add_convert(add_parser: AddParser) -> None:

@@ -137,7 +137,16 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
             stack.enter_context(named_in_warnings(Path(target), STANDARD_OUTPUT))
         own = {"input": stack.enter_context(input_file(source)), "output": Path(target)}
         job = argparse.Namespace(**{**vars(options), **own})
-        yield [SceneJob(options=job, to_stream=to_stream)]
+        try:
+            yield [SceneJob(options=job, to_stream=to_stream)]
+        except OutputError as error:
+            if not (to_stream and str(target) in str(error)):
+                raise
+            reason = str(error).rpartition("found: ")[2]
+            raise OutputError(
+                "the folder of temporary files must be writable and have room for the output, "
+                f"found: {reason.removesuffix('.')}; TMPDIR sets another folder."
+            ) from error
 
 
 @contextmanager

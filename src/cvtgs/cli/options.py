@@ -225,9 +225,10 @@ class CommandParser(argparse.ArgumentParser):
         if self.check is not None:  # allows paths between options
             known.paths += [word for word in rest if word == "-" or not word.startswith("-")]
             rest = [word for word in rest if word != "-" and word.startswith("-")]
-            self.check(self, known)
         if rest and self._subparsers is None:
             self.error(f"unrecognized arguments: {' '.join(rest)}{self._ratios_hint(rest)}")
+        if self.check is not None:
+            self.check(self, known)
         return known, rest
 
     def _ratios_hint(self, rest: Sequence[str]) -> str:

@@ -164,7 +164,8 @@ def _document(
         "extensions": {SPLATS: splatting},
     }
     if scene.comments:
-        primitive["extras"] = {"comments": list(scene.comments)}
+        lines = [line for comment in scene.comments for line in comment.splitlines()]
+        primitive["extras"] = {"comments": lines}
     required = {} if compressed is None else {"extensionsRequired": used}
     return {
         "asset": {"version": "2.0", "generator": "cvtgs"},
