@@ -74,7 +74,7 @@ def test_the_page_starts_with_the_simplified_scene(page: Any) -> None:
     assert page.server.address == "http://127.0.0.1:8080"
     assert page.stand.scene.up == "-y"
     assert visible(page) == [50]
-    assert control(page, FACTS).content.startswith("50 of 500 Gaussians, 5.2 kB as .ply, ")
+    assert control(page, FACTS).content.startswith("50 of 500 Gaussians, about 5.2 kB as .ply, ")
     assert control(page, "show").options == ("simplified", "full scene", "other.ply")
 
 
@@ -85,7 +85,7 @@ def test_an_ipv6_host_is_in_brackets(page: Any, monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.slow
 def test_moving_the_slider_shows_the_simplified_scene(page: Any, scene: GaussianScene) -> None:
-    control(page, "log10 of rho").value = -2.0
+    control(page, "ratio (log10)").value = -2.0
     until(lambda: visible(page) == [5])
     until(lambda: control(page, FACTS).content.startswith("5 of 500 Gaussians"))
     wanted = Simplifier(preset="draft", device="cpu").simplify(scene, 0.01)
@@ -103,7 +103,7 @@ def test_the_ratio_to_start_with_is_exact(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(SceneViewer, "simplify", simplify)
     server = ViewerServer(SceneViewer(random_scene(3)), rho=0.00011)
     server.finish()
-    slider = viser_stand_in.ViserServer.latest.gui.controls["log10 of rho"]
+    slider = viser_stand_in.ViserServer.latest.gui.controls["ratio (log10)"]
     assert slider.value == pytest.approx(-3.95)
     slider.value = -2.0
     until(lambda: len(seen) == 2)
@@ -129,7 +129,7 @@ def test_presets_and_scenes_can_be_switched(page: Any) -> None:
     until(lambda: control(page, FACTS).content.endswith("with fast"))
     control(page, "show").value = "full scene"
     assert visible(page) == [500]
-    assert control(page, FACTS).content == "500 of 500 Gaussians, 52.0 kB as .ply"
+    assert control(page, FACTS).content == "500 of 500 Gaussians, about 52.0 kB as .ply"
     control(page, "show").value = "other.ply"
     assert visible(page) == [7]
 
@@ -143,9 +143,9 @@ def test_too_little_memory_is_an_error_on_the_page(
 
     with monkeypatch.context() as patch:
         patch.setattr(SceneViewer, "simplify", fail)
-        control(page, "log10 of rho").value = -1.5
+        control(page, "ratio (log10)").value = -1.5
         until(lambda: "this needs more memory than is available" in notes(page))
-    control(page, "log10 of rho").value = -2.0
+    control(page, "ratio (log10)").value = -2.0
     until(lambda: control(page, FACTS).content.startswith("5 of 500 Gaussians"))
 
 
@@ -166,11 +166,11 @@ def test_the_shown_scene_is_saved(
     monkeypatch.chdir(tmp_path)
     control(page, "file").value = "out.ply"
     for said in ("out.ply: 50 Gaussians.", "must not exist yet, found a file"):
-        control(page, "save this scene").call()
+        control(page, "Save this scene").call()
         assert said in notes(page)
     assert same_bits(load("out.ply"), page.viewer.scenes["simplified"].scene)
     control(page, "file").value = "  "
-    control(page, "save this scene").call()
+    control(page, "Save this scene").call()
     assert notes(page) == "**a file name is needed to save a scene, found none.**"
 
 
@@ -181,7 +181,7 @@ def test_markup_in_names_is_not_interpreted(
     monkeypatch.chdir(tmp_path)
     path = "*a* <iframe srcdoc='<img src=x onerror=f()>'> `b`.ply"
     control(page, "file").value = path
-    control(page, "save this scene").call()
+    control(page, "Save this scene").call()
     assert notes(page) == f"{path}: 50 Gaussians."
     assert not re.search(r"(?<!\\)[<>*`_]", control(page, NOTES).content)
 

@@ -117,7 +117,7 @@ def control(label: str) -> Any:
 @pytest.mark.parametrize("name", ["/tmp/a.ply", "../a.ply", "a/../../b.ply", "C:a.ply", "a\\b.ply"])
 def test_scenes_are_saved_in_the_folder_of_the_program(page: Any, name: str) -> None:
     control("file").value = name
-    control("save this scene").call()
+    control("Save this scene").call()
     assert "in the folder where the program was started" in control("markdown 7").content
 
 
@@ -128,9 +128,9 @@ def test_scenes_are_saved_in_the_folder_of_the_program(page: Any, name: str) -> 
 def test_any_value_of_the_slider_leaves_the_page_working(
     page: Any, value: Any, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    control("log10 of rho").value = value
+    control("ratio (log10)").value = value
     until(said)
-    control("log10 of rho").value = -1.0
+    control("ratio (log10)").value = -1.0
     until("10 of 100 Gaussians")
     assert ("TypeError" in capsys.readouterr().err) == (value == "text")
 

@@ -347,7 +347,7 @@ def test_the_page_has_plot_table_and_slider(page):
     assert attribute(html, "ready") == "yes"
     table = re.search(r'<table id="tradeoff">.*?</table>', html, re.DOTALL).group(0)
     assert "rho 0.1: 50 of 500 Gaussians" in table
-    assert "<th>draft</th>" in table
+    assert '<th scope="row">draft</th>' in table
     assert 'class="chart" src="data:image/png;base64,' in html
     assert "50 Gaussians" in html
     assert "<b>draft 0.1</b>" in html

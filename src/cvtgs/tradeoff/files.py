@@ -33,15 +33,16 @@ SUMMARY = """\
 <section class="tradeoff">
 <h2>Quality against time</h2>
 {% if chart %}
-<img class="chart" src="data:image/png;base64,{{ chart }}" alt="PSNR and SSIM over seconds, a line \
-per ratio; the table has the same numbers">
+<div class="scroller" role="region" tabindex="0" aria-label="Chart"><img class="chart" \
+src="data:image/png;base64,{{ chart }}" alt="PSNR and SSIM over seconds, a line per ratio; the \
+table has the same numbers"></div>
 {% endif %}
-<div class="scroller"><table id="tradeoff">
-<thead><tr>{% for name in headings %}<th>{{ name }}</th>{% endfor %}</tr></thead>
+<div class="scroller" role="region" tabindex="0" aria-label="Table"><table id="tradeoff">
+<thead><tr>{% for name in headings %}<th scope="col">{{ name }}</th>{% endfor %}</tr></thead>
 {% for title, rows in groups %}
-<tbody><tr><th class="group" colspan="{{ headings | length }}">{{ title }}</th></tr>
+<tbody><tr><th class="group" scope="rowgroup" colspan="{{ headings | length }}">{{ title }}</th></tr>
 {% for row in rows %}
-<tr><th>{{ row[0] }}</th>
+<tr><th scope="row">{{ row[0] }}</th>
 {%- for text in row[1:] %}
 <td{% if text.endswith(mark) %} class="best"{% endif %}>{{ text }}</td>
 {%- endfor %}

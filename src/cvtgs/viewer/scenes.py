@@ -153,7 +153,7 @@ class SceneViewer:
 def _counted(scene: GaussianScene, full: GaussianScene) -> str:
     columns = 17 + 3 * scene.shN.shape[1]
     size = size_text(4 * columns * len(scene))
-    return f"{len(scene):,} of {counted(len(full), 'Gaussian')}, {size} as .ply"
+    return f"{len(scene):,} of {counted(len(full), 'Gaussian')}, about {size} as .ply"
 
 
 def camera_of(

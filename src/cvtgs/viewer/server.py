@@ -201,7 +201,7 @@ class ViewerServer:
         self._facts = gui.add_markdown("")
         start = round(math.log10(rho) / step) * step
         self._slider = gui.add_slider(
-            "log10 of rho", min=min(low, start), max=high, step=step, initial_value=start
+            "ratio (log10)", min=min(low, start), max=high, step=step, initial_value=start
         )
         presets = tuple(PRESETS)
         self._preset = gui.add_dropdown("preset", presets, initial_value=preset)
@@ -210,7 +210,7 @@ class ViewerServer:
         )
         score = gui.add_button("PSNR of this view")
         self._path = gui.add_text("file", "small.ply")
-        keep = gui.add_button("save this scene")
+        keep = gui.add_button("Save this scene")
         self._notes = gui.add_markdown("")
         self._slider.on_update(lambda _: self._move())
         self._preset.on_update(lambda _: self._wanted.set())
