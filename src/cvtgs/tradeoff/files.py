@@ -40,7 +40,8 @@ table has the same numbers"></div>
 <div class="scroller" role="region" tabindex="0" aria-label="Table"><table id="tradeoff">
 <thead><tr>{% for name in headings %}<th scope="col">{{ name }}</th>{% endfor %}</tr></thead>
 {% for title, rows in groups %}
-<tbody><tr><th class="group" scope="rowgroup" colspan="{{ headings | length }}">{{ title }}</th></tr>
+<tbody>
+<tr><th class="group" scope="rowgroup" colspan="{{ headings | length }}">{{ title }}</th></tr>
 {% for row in rows %}
 <tr><th scope="row">{{ row[0] }}</th>
 {%- for text in row[1:] %}
