@@ -167,7 +167,7 @@ def test_comments_are_kept_wherever_they_are_in_the_header(tmp_path: Path) -> No
     path = tmp_path / "s.ply"
     path.write_bytes(data)
     scene = load(path)
-    assert scene.comments == ("SplatRenderMode: mip", "", " two  blanks", "K\u00e4se")
+    assert scene.comments == ("SplatRenderMode: mip", "", " two  blanks", "7", "K\u00e4se")
     assert scene.antialiased
     assert same(scene, load_with_plyfile(path))
 

@@ -131,10 +131,10 @@ def read_header(file: BinaryIO, path: str) -> Header:
     comments: list[str] = []
     for number, line in enumerate(lines, start=2):
         match line.split():
-            case [] | ["obj_info", *_]:
+            case []:
                 pass
-            case ["comment", *_]:
-                comments.append(line.lstrip()[len("comment ") :].rstrip())
+            case ["comment" | "obj_info" as word, *_]:  # both are free text
+                comments.append(line.lstrip()[len(word) + 1 :].rstrip())
             case ["format", kind, "1.0"] if encoding is None and kind in get_args(Encoding):
                 encoding = kind  # type: ignore[assignment]
             case ["element", name, count] if _COUNT.fullmatch(count) and is_name(name):
