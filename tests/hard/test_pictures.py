@@ -11,7 +11,7 @@ import torch
 import cvtgs
 from benchmarks.baselines.pruning import keep_most_mass
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.errors import DroppedDataWarning
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
 from cvtgs.evaluation import EvaluationSettings, evaluate
 from cvtgs.refinement import refine
 from cvtgs.rendering import render
@@ -91,7 +91,11 @@ def test_each_case(make, dtype, subtests):
             with subtests.test("images and gradients are finite", device=device, backend=backend):
                 check_that_images_and_gradients_are_finite(make, scene, device, backend)
     with subtests.test("scores are numbers for both presets"):
-        check_that_scores_are_numbers(scene.select(valid_rows(scene)))
+        if make.__name__ == "tiny_world":  # equal empty images would have an infinite PSNR
+            with pytest.raises(InvalidArgumentError, match="the cameras must see"):
+                check_that_scores_are_numbers(scene.select(valid_rows(scene)))
+        else:
+            check_that_scores_are_numbers(scene.select(valid_rows(scene)))
     for device in DEVICES:
         with subtests.test("two steps of refinement leave a standard scene", device=device):
             check_that_refinement_leaves_a_standard_scene(make, scene.to(device), device)

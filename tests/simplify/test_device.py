@@ -20,7 +20,7 @@ from pretended_device import CUDA, DeviceTensor, pretended_cuda
 from scenes import random_scene, same_bits
 
 PRESETS = ["draft", "fast", "standard", "paper"]
-WAITS, COPIES = 120, 3
+WAITS, COPIES = 120, 4
 """Largest numbers of host waits and of copies in one simplification.
 
 Most waits are for the sizes of lists: each search for nearest sites waits 5 to 15 times, each

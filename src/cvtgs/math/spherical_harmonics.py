@@ -4,13 +4,11 @@ import math
 from functools import cache
 from itertools import pairwise, product
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
 from torch import Tensor
 
-from cvtgs.devices import row_chunks
+from cvtgs.devices import move_together, row_chunks
 from cvtgs.errors import InvalidArgumentError
 
 SH_C0 = 0.5 / math.sqrt(math.pi)
@@ -151,9 +149,7 @@ def clamped_parts(
         >>> round(SH_C0 * clamped_parts(dark, torch.zeros(1, 0, 3)).mean().item(), 6)
         0.25
     """
-    basis, fit = (
-        torch.as_tensor(matrix, device=sh0.device) for matrix in _fit(degree_of(shN.shape[1]))
-    )
+    basis, fit = _fit(degree_of(shN.shape[1]), sh0.device)
     offset, parts = basis.new_full((), -0.5), []
     for rows in row_chunks(len(sh0), CHUNK, sh0.device):
         columns = torch.cat([sh0[rows], shN[rows]], dim=1).double().permute(1, 0, 2).flatten(1)
@@ -163,7 +159,10 @@ def clamped_parts(
 
 
 @cache
-def _fit(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+@torch.inference_mode(mode=False)
+def _fit(
+    degree: int, device: torch.device
+) -> tuple[Float[Tensor, "d k_plus_1"], Float[Tensor, "k_plus_1 d"]]:
     """Return the basis functions in directions to the neighbours in a lattice, and the fit."""
     places = [place for place in product((0, 1, -1), repeat=3) if any(place)]
     shares = [(1 / 21, 4 / 105, 9 / 280)[sum(map(abs, place)) - 1] for place in places]
@@ -171,8 +170,10 @@ def _fit(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         places, shares = places[:1], [1.0]
     points = torch.tensor(places, dtype=torch.float64, device="cpu")
     rest = rest_basis(points / torch.linalg.vector_norm(points, dim=1, keepdim=True), degree)
-    basis = np.concatenate([np.full((len(places), 1), SH_C0), rest.numpy()], axis=1)
-    return basis, 4 * math.pi * np.array(shares) * basis.T
+    basis = torch.nn.functional.pad(rest, (1, 0), value=SH_C0)
+    fit = 4 * math.pi * points.new_tensor(shares) * basis.T
+    moved, fit_there = move_together([basis, fit.contiguous()], device)
+    return moved, fit_there
 
 
 def rotated_rest(
