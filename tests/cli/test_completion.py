@@ -34,6 +34,8 @@ def test_bash_completes_commands_options_values_and_files(bash, tmp_path, monkey
     assert completed(bash, "cvtgs", "si") == ["simplify"]
     assert completed(bash, "cvtgs", "simplify", "in.ply", "--max") == ["--max-count"]
     assert completed(bash, "cvtgs", "simplify", "--preset", "") == list(cvtgs.PRESETS)
+    assert completed(bash, "cvtgs", "simplify", "--preset", "=") == list(cvtgs.PRESETS)
+    assert completed(bash, "cvtgs", "simplify", "--preset", "=", "st") == ["standard"]
     assert completed(bash, "cvtgs", "levels", "--backend", "n") == ["numba"]
     assert completed(bash, "cvtgs", "completion", "f") == ["fish"]
     assert completed(bash, "cvtgs", "simplify", "sc") == ["scan.ply"]

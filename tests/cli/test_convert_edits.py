@@ -96,6 +96,7 @@ def test_edits_use_the_axes_of_a_ply(tmp_path: Path, scene: GaussianScene) -> No
         (["--rotate", ""], "--rotate must be three numbers x,y,z, degrees about each axis, found"),
         (["--translate", ""], "--translate must be three numbers x,y,z, found ''"),
         (["--translate", "nan,0,0"], "--translate must be three numbers x,y,z, found 'nan,0,0'"),
+        (["--merge", "-"], "--merge takes files; only IN may be - for standard input."),
         (["--merge", "missing.ply"], "missing.ply: the file to read must exist, found none."),
         (
             ["--merge", "https://example.org/a.ply"],

@@ -22,6 +22,11 @@ _cvtgs() {{
         COMPREPLY=($(compgen -W "{commands}" -- "$current"))
         return
     fi
+    if [ "$current" = "=" ]; then  # bash splits --option=value into three words
+        current=""
+    elif [ "$before" = "=" ]; then
+        before="${{COMP_WORDS[COMP_CWORD-2]}}"
+    fi
     case "$command $before" in
 {values}
     esac

@@ -5,12 +5,14 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import cvtgs
 from cvtgs.cli.display import say, say_wrapped
 from cvtgs.cli.jobs import (
     STANDARD_INPUT,
+    STREAM,
     Outcome,
     SceneJob,
     add_paths,
@@ -328,6 +330,11 @@ def convert(options: argparse.Namespace) -> None:
         run_jobs(jobs, lambda job: _convert_one(job, edits))
 
 
+def _format_of(path: Path) -> str:
+    suffix = cvtgs.io.scene_file(path).suffix.lower()
+    return ".sog" if suffix == ".json" else suffix  # a .sog is a packed meta.json
+
+
 def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
     """Convert one scene, and report the data that is lost."""
     from cvtgs.io.limits import LOST_DIGITS
@@ -339,9 +346,10 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
             options.input, axes=axes.source, trust_sizes=options.trust_sizes, lod=options.lod
         )
     ]
-    kind = cvtgs.io.scene_file(options.input).suffix.lower()
     for path in options.merge:
-        alike = cvtgs.io.scene_file(path).suffix.lower() == kind
+        if str(path) == STREAM:
+            raise InvalidArgumentError("--merge takes files; only IN may be - for standard input.")
+        alike = _format_of(path) == _format_of(options.input)
         source = axes.source if alike else None  # other formats have axes of their own
         scenes.append(cvtgs.io.load(path, axes=source, trust_sizes=options.trust_sizes))
     # What is dropped is printed below instead.

@@ -129,7 +129,7 @@ def group_radius(points: Float[Tensor, "n 3"]) -> float:
     """Estimate the radius of the groups that points consist of, as a person would look at them.
 
     It is seven times the median, over a sample of evenly spaced rows, of the distance within which
-    a point has a twentieth of all. This is 1.1 to 3.3 robust radii in scenes that are one group, and
+    a point has a twentieth of all. This is 1.1 to 3.3 robust radii in scenes of one group, and
     about three radii of a group where two or more are much further apart than they are wide.
 
     Args:
