@@ -3,10 +3,11 @@
 import pytest
 import torch
 
-from cvtgs import GaussianScene, Simplifier, SimplifyConfig, synthetic
+from cvtgs import GaussianScene, Simplifier, SimplifyConfig, load, save, synthetic
 from cvtgs.cells import Partition, merge_cells
 from cvtgs.config import MergeConfig
 from cvtgs.math.spherical_harmonics import SH_C0, evaluate
+from cvtgs.outofcore import simplify_file
 from scenes import random_scene, same_bits
 
 PAIR = Partition.from_labels(torch.tensor([0, 0]), 1)
@@ -74,6 +75,22 @@ def test_cells_show_the_colours_of_their_members(degree):
         for clamping in (False, True)
     )
     assert raised < 0.5 * plain
+
+
+@pytest.mark.parametrize("blocks", [1, 4])
+def test_blocks_are_as_bright(tmp_path, blocks):
+    scene = synthetic.scene("object", 4000, sh_degree=1, seed=0)
+    save(scene.with_tensors(sh0=scene.sh0 - 0.35 / SH_C0), tmp_path / "in.ply")
+    found = {}
+    for clamping in ("auto", "off"):
+        config = SimplifyConfig(preset="fast", effects={"clamping": clamping})
+        one = Simplifier(config=config, device="cpu")
+        simplify_file(
+            tmp_path / "in.ply", tmp_path / "out.ply", 0.05, simplifier=one, blocks=blocks
+        )
+        found[clamping] = load(tmp_path / "out.ply").sh0.mean()
+        (tmp_path / "out.ply").unlink()
+    assert found["auto"] > found["off"] + 0.02
 
 
 def test_the_plan_decides_for_all_runs():

@@ -337,6 +337,15 @@ def test_two_commands_work_in_a_pipe(scenes: Path) -> None:
     assert done.stdout.splitlines()[-1].startswith("z.splat: 10 Gaussians of SH degree 0, ")
 
 
+def test_a_full_folder_of_temporary_files_is_named(scenes: Path) -> None:
+    """Standard output is written as a file first; its path is nobody's business."""
+    line = f"ulimit -f 1; {sys.executable} -m cvtgs convert a.ply - | cat > b.ply"
+    done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False)
+    said = " ".join(done.stderr.split())
+    assert "cvtgs: error: the folder of temporary files must be writable and have room" in said
+    assert "found: file too large; TMPDIR sets another folder." in said
+
+
 def test_a_scene_is_not_written_to_a_terminal(
     scenes: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

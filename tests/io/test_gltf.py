@@ -5,6 +5,7 @@ import io
 import json
 import math
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,12 @@ def test_round_trip(tmp_path: Path, degree: int, end: str) -> None:
     if end == "glb":
         assert_as_oracle(change_axes(again, "rdf", "luf"), read_glb(path.read_bytes()))
     assert losses(scene, path).dropped == ()
+
+
+def test_comments_of_several_lines_are_kept_line_by_line(tmp_path: Path) -> None:
+    scene = replace(storable_scene(3), comments=("one\ntwo", "three"))
+    save(scene, tmp_path / "a.glb")
+    assert load(tmp_path / "a.glb").comments == ("one", "two", "three")
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

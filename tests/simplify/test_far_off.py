@@ -5,10 +5,12 @@ import torch
 
 import cvtgs
 from cvtgs import GaussianScene, Simplifier
+from cvtgs.cells import Partition
 from cvtgs.devices import one_thread
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.math.frames import robust_frame
 from cvtgs.outofcore import simplify_file
+from cvtgs.pipeline import moved_back
 from cvtgs.views import automatic_views
 from scenes import random_scene, same_bits
 
@@ -88,6 +90,36 @@ def test_groups_far_apart_are_seen_from_near(near, distance):
     alone = psnr(near, cvtgs.simplify(near, 0.1, device="cpu"))
     assert psnr(near, corrected) > psnr(near, plain) + 0.3
     assert psnr(near, corrected) > alone - 1.5
+
+
+def test_groups_far_apart_in_blocks(near, tmp_path):
+    both = cvtgs.concatenate([near, moved_to(near, torch.tensor([1e3, 0.0, 0.0]))])
+    cvtgs.save(both, tmp_path / "both.ply")
+    simplify_file(tmp_path / "both.ply", tmp_path / "small.ply", 0.1, blocks=2)
+    whole = cvtgs.simplify(both, 0.1, device="cpu")
+    assert psnr(near, cvtgs.load(tmp_path / "small.ply")) > psnr(near, whole) - 0.3
+
+
+def test_far_landscapes_are_contracted_about_their_centre():
+    near = cvtgs.synthetic.scene("landscape", 6000, sh_degree=0, seed=1)
+    near = near.with_tensors(means=(near.means * 64).round() / 64)
+    small, report = Simplifier(device="cpu").run(moved_to(near, SHIFT), 0.02)
+    assert report.plan.unbounded.active
+    wanted = moved_to(moved_to(cvtgs.simplify(near, 0.02, device="cpu"), SHIFT), -SHIFT)
+    assert psnr(near, moved_to(small, -SHIFT)) > psnr(near, wanted) - 0.3
+
+
+def test_single_members_keep_their_very_position():
+    """Near the origin of a far scene, the difference from its centre is rounded."""
+    scene = random_scene(3, degree=0)
+    scene = scene.with_tensors(means=torch.tensor([[1e5, 0, 0], [0.1, 0.2, 0.3], [1e5, 1, 0]]))
+    origin = torch.tensor([1e5, 0.5, 0.0])
+    cells = Partition.from_labels(torch.tensor([0, 1, 0]), 2)
+    small = scene.select(torch.tensor([0, 1])).with_tensors(means=scene.means[:2] - origin)
+    back = moved_back(small, origin, scene, cells).means
+    assert torch.equal(back[1], scene.means[1])
+    assert not torch.equal((small.means + origin)[1], scene.means[1])
+    assert torch.equal(back[0], (small.means + origin)[0])
 
 
 def test_a_protected_region_stays_in_place(far):
