@@ -6,7 +6,6 @@ blocks call the functions of each stage in the same order, block by block (``out
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -28,7 +27,6 @@ from cvtgs.grouping import (
     weigh_rows,
     with_importance,
 )
-from cvtgs.math.frames import RobustFrame
 from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import Net, correct_cells
 from cvtgs.report import CellStatistics, MatchReport
@@ -106,10 +104,7 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
     if target >= len(scene.means):
         return Reduced(standardized(scene) if target < total else with_finite_opacities(scene))
     used = drop_unused_bands(scene, analysis.plan)
-    used, origin = centered(used, analysis.frame)
-    if origin is not None:
-        frame = replace(analysis.frame, center=analysis.frame.center - origin)
-        analysis = replace(analysis, frame=frame)
+    origin = analysis.frame.far_origin(used.means)
     merged, partition, statistics = group_and_merge(
         used,
         analysis,
@@ -119,13 +114,14 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
         clock=clock,
         ordered=ordered,
         importance=importance,
+        origin=origin,
     )
     small = merged.scene
     if net is not None:
         with clock.stage("network", target) as advance:
             small = correct_cells(
                 net,
-                used,
+                moved_from(used, origin),
                 small,
                 merged.partition,
                 neighbors=merged.neighbors,
@@ -140,12 +136,9 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
     )
 
 
-def centered(
-    scene: GaussianScene, frame: RobustFrame
-) -> tuple[GaussianScene, Float[Tensor, "3"] | None]:
-    """Move a float32 scene to the origin if it is far from it, so that merging rounds less."""
-    origin = frame.far_origin(scene.means)
-    return (scene if origin is None else scene.with_tensors(means=scene.means - origin)), origin
+def moved_from(scene: GaussianScene, origin: Float[Tensor, "3"] | None) -> GaussianScene:
+    """Subtract an origin from positions, so that merging does not round those of float32."""
+    return scene if origin is None else scene.with_tensors(means=scene.means - origin)
 
 
 def moved_back(
@@ -156,7 +149,7 @@ def moved_back(
     return small.with_tensors(means=torch.where(is_single, scene.means[rows], small.means + origin))
 
 
-def group_and_merge(
+def group_and_merge(  # noqa: PLR0913 (options by name)
     scene: GaussianScene,
     analysis: SceneAnalysis,
     target: int,
@@ -166,6 +159,7 @@ def group_and_merge(
     clock: StageClock,
     ordered: OrderedRows | None = None,
     importance: Float[Tensor, "n"] | None = None,
+    origin: Float[Tensor, "3"] | None = None,
 ) -> tuple[Merged, cells.Partition, CellStatistics]:
     """Run the stages before the network: filter, weigh, tessellate, allocate, merge.
 
@@ -178,6 +172,7 @@ def group_and_merge(
         clock: Measures each stage.
         ordered: As for :func:`reduce_scene`.
         importance: As for :func:`reduce_scene`.
+        origin: Point that is subtracted from positions before cells merge; None for none.
 
     Returns:
         One Gaussian per cell, the rows that make up every cell, and statistics.
@@ -197,7 +192,7 @@ def group_and_merge(
     del points, labels, tessellation
     with clock.stage("merge", target) as advance:
         merged = merge_and_inflate(
-            scene,
+            moved_from(scene, origin),
             partition,
             config.merge,
             areas=analysis.areas,

@@ -122,6 +122,15 @@ def test_single_members_keep_their_very_position():
     assert torch.equal(back[0], (small.means + origin)[0])
 
 
+def test_a_second_run_gives_the_same_bits(far):
+    """It uses cached neighbours and an order of the rows, which no shift may change."""
+    strays = random_scene(5, degree=0)  # so near the origin that a shift rounds them
+    prepared = Simplifier(device="cpu").prepare(cvtgs.concatenate([far, strays]))
+    first, second, third = (prepared.run(0.1).scene for _ in range(3))
+    assert same_bits(first, second)
+    assert same_bits(second, third)
+
+
 def test_a_protected_region_stays_in_place(far):
     keep = torch.arange(len(far)) < 20
     small = Simplifier(device="cpu").simplify(far, 0.05, keep=keep)

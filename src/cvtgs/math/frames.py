@@ -141,7 +141,8 @@ def group_radius(points: Float[Tensor, "n 3"]) -> float:
     sample = points[:: max(1, len(points) >> 9)].double()
     if len(sample) < GROUPED:
         return math.inf
-    near = torch.cdist(sample[::16], sample).kthvalue(len(sample) // 20, dim=1).values
+    mode = "donot_use_mm_for_euclid_dist"  # products would lose digits far from the origin
+    near = torch.cdist(sample[::16], sample, compute_mode=mode).kthvalue(len(sample) // 20).values
     return 7.0 * float(near.median()) or math.inf
 
 

@@ -22,9 +22,9 @@ from cvtgs.outofcore.job import Job, Step
 from cvtgs.outofcore.rows import BlockRows, analysis_of, read_members, read_rows
 from cvtgs.pipeline import (
     Reduced,
-    centered,
     merge_members,
     moved_back,
+    moved_from,
     neighbor_count,
     reduce_scene,
     shape_merged,
@@ -61,14 +61,13 @@ def merge(job: Job, block: int) -> None:
     if job.has("merged", block):
         return
     found = read_cells(job, block)
-    partition = found.partition
-    scene, _ = centered(found.scene, job.read_scan().frame)
+    scene, partition, scan = found.scene, found.partition, job.read_scan()
     merged, shown = merge_members(
-        scene,
+        moved_from(scene, scan.frame.far_origin(scene.means)),
         partition,
         job.config.merge,
         areas=scene.areas,
-        clamping=job.read_scan().plan.clamping.active,
+        clamping=scan.plan.clamping.active,
     )
     first = shown.order[shown.offsets[:-1]]
     more = {
@@ -112,7 +111,7 @@ def correct(job: Job, block: int) -> None:
     if job.small_path(block).exists():
         return
     original, scene, _, visibility, partition = read_cells(job, block)
-    scene, origin = centered(scene, job.read_scan().frame)
+    origin = job.read_scan().frame.far_origin(scene.means)
     own = job.read("inflated", block)
     shown = partition.keep_only(own["representatives"])
     small, sizes = _with_halo(job, "inflated", block, own["remote"])
@@ -120,7 +119,7 @@ def correct(job: Job, block: int) -> None:
     if net is not None:
         small = correct_cells(
             net,
-            scene,
+            moved_from(scene, origin),
             small,
             shown,
             neighbors=own["neighbors"],
