@@ -1,5 +1,6 @@
 """Edits of ``cvtgs convert``."""
 
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -192,6 +193,21 @@ def test_double_precision_far_from_the_origin_is_lost_in_steps() -> None:
     for suffix, step in ((".glb", "0.5"), (".splat", "0.5"), (".spz", "1")):
         lost = {*losses(far, suffix).dropped} - {*losses(double, suffix).dropped}
         assert lost == {f"digits of positions (steps of {step} so far from the origin)"}
+
+
+def test_packed_and_unpacked_sog_have_the_same_axes(tmp_path: Path, scene: GaussianScene) -> None:
+    packed, folder = tmp_path / "a.sog", tmp_path / "unpacked"
+    save(scene, packed)
+    with zipfile.ZipFile(packed) as archive:
+        archive.extractall(folder)
+    found = []
+    for other in (packed, folder / "meta.json"):
+        target = tmp_path / f"{other.name}.ply"
+        words = ["convert", str(packed), str(target), "--merge", str(other), "--axes", "rub"]
+        assert main(words) == 0
+        found.append(load(target))
+    assert same_bits(*found)
+    assert not same_bits(found[0], merge([load(packed)] * 2))
 
 
 def test_a_merged_scene_of_which_some_are_flat_loses_the_tag(
