@@ -28,7 +28,7 @@ FULLY_UNBOUNDED_SHARE = 0.1
 DUPLICATE_SHARE = 0.01
 """With more than this share of duplicates, it pays to search only once per position."""
 
-CLAMPED = 2e-3  # where less of full brightness is below zero, up to 0.02 dB can be gained
+CLAMPED = 2e-3  # if colours below zero take less of full brightness, 0.02 dB can be gained
 UNBOUNDED_DISTANCE = 3.0  # distance beyond which Gaussians count as far away, in robust radii
 SAMPLE = 1 << 14
 """Approximate size of the sample, evenly spaced in the rows, that is examined first."""
@@ -148,9 +148,8 @@ def plan_effects(
         duplicate_share(scene.means, scene.sh0),
         mean_clamped(scene, masses),
     ]
-    far, hazy, duplicates, clamped = torch.stack(
-        shares
-    ).tolist()  # one synchronization with the device
+    figures = torch.stack(shares).tolist()  # one synchronization with the device
+    far, hazy, duplicates, clamped = figures
     above = (far - UNBOUNDED_SHARE) / (FULLY_UNBOUNDED_SHARE - UNBOUNDED_SHARE)
     beyond = f"of the mass is beyond {UNBOUNDED_DISTANCE:g} robust radii"
     unbounded = _by_share(far, choices.unbounded, UNBOUNDED_SHARE, beyond)
