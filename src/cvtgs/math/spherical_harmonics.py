@@ -172,8 +172,8 @@ def _fit(
     rest = rest_basis(points / torch.linalg.vector_norm(points, dim=1, keepdim=True), degree)
     basis = torch.nn.functional.pad(rest, (1, 0), value=SH_C0)
     fit = 4 * math.pi * points.new_tensor(shares) * basis.T
-    moved, fit_there = move_together([basis, fit.contiguous()], device)
-    return moved, fit_there
+    basis, fit = move_together([basis, fit.contiguous()], device)
+    return basis, fit
 
 
 def rotated_rest(

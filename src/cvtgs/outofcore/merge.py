@@ -111,7 +111,8 @@ def correct(job: Job, block: int) -> None:
     if job.small_path(block).exists():
         return
     original, scene, _, visibility, partition = read_cells(job, block)
-    origin = job.read_scan().frame.far_origin(scene.means)
+    scan = job.read_scan()
+    origin = scan.frame.far_origin(scene.means)
     own = job.read("inflated", block)
     shown = partition.keep_only(own["representatives"])
     small, sizes = _with_halo(job, "inflated", block, own["remote"])
@@ -124,14 +125,13 @@ def correct(job: Job, block: int) -> None:
             shown,
             neighbors=own["neighbors"],
             visibility=visibility,
-            pixel_size=job.read_scan().frame.view_radius / job.config.merge.image_size,
+            pixel_size=scan.frame.view_radius / job.config.merge.image_size,
             sizes=sizes,
         )
     tensors = {name: values[: len(own["sizes"])] for name, values in small.tensors().items()}
     small = scene.with_tensors(tensors, under_prefix(EXTRA, own))
     if origin is not None:
         small = moved_back(small, origin, original, shown)
-    scan = job.read_scan()
     is_whole = job.read_manifest().total == scan.row_count
     finish = validity.with_finite_opacities if is_whole else validity.standardized
     small = restore_columns(finish(small), original, scan.plan)
