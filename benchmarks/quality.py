@@ -38,8 +38,8 @@ from cvtgs.evaluation import (
     fit_cameras,
     load_lpips,
     load_photographs,
+    scorer as scorers,
 )
-from cvtgs.evaluation import scorer as scorers
 from cvtgs.evaluation.scorer import mean_of
 from cvtgs.views import automatic_views
 

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 import cvtgs
-from benchmarks import cameras as camera_files
-from benchmarks import choices, heights
+from benchmarks import cameras as camera_files, choices, heights
 from cvtgs.edit import Motion, move
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.tags import ANTIALIASED

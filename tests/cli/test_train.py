@@ -10,8 +10,7 @@ import cvtgs
 from cvtgs.cli.main import main
 from cvtgs.errors import MissingDependencyError
 from cvtgs.mergenet import load_checkpoint, save_checkpoint
-from cvtgs.train import Gain, History, Validation
-from cvtgs.train import loop as train_loop
+from cvtgs.train import Gain, History, Validation, loop as train_loop
 from train_cases import needs_matplotlib, write_scenes
 
 CONFIG = """

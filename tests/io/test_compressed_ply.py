@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from cvtgs import GaussianScene, load, save
 from cvtgs.errors import DroppedDataWarning, FileFormatError

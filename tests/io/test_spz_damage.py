@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 import zstandard
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from cvtgs import load
 from cvtgs.errors import DroppedDataWarning, FileFormatError

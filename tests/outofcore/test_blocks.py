@@ -18,8 +18,7 @@ from cvtgs.errors import ConfigError, FileFormatError, InvalidArgumentError, Inv
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.io.ply import open_rows
 from cvtgs.math.frames import robust_frame
-from cvtgs.outofcore import allocate, simplify_file
-from cvtgs.outofcore import scan as scan_module
+from cvtgs.outofcore import allocate, scan as scan_module, simplify_file
 from cvtgs.outofcore.memory import SMALL_BASE_BYTES, block_count, needed_memory, read_bytes
 from cvtgs.outofcore.scan import (
     RangeTotals,

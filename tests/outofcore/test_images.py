@@ -11,8 +11,7 @@ from cvtgs.boxes import Box
 from cvtgs.clock import StageCost
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import EvaluationSettings
-from cvtgs.outofcore import LocalWorkers, simplify_file
-from cvtgs.outofcore import images as module
+from cvtgs.outofcore import LocalWorkers, images as module, simplify_file
 from cvtgs.outofcore.memory import IMAGE_BYTES, LEAST_BYTES
 from cvtgs.report import MatchReport, RefineReport
 from cvtgs.views import automatic_views, mixed_views

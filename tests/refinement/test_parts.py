@@ -10,9 +10,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.errors import ConfigError
 from cvtgs.evaluation import scorer as scorer_module
 from cvtgs.evaluation.scorer import BLACK, WHITE, Metrics, Scorer, ViewImages, render_views
-from cvtgs.refinement import RefineConfig
-from cvtgs.refinement import images as images_module
-from cvtgs.refinement import optimize as optimize_module
+from cvtgs.refinement import RefineConfig, images as images_module, optimize as optimize_module
 from cvtgs.refinement.images import ImageBuffer, RefineViews, generated_views, split_views
 from cvtgs.refinement.optimize import Limits, heldout_psnr, psnr_cap, step_factor
 from cvtgs.rendering import observe

@@ -11,8 +11,7 @@ from cvtgs import GaussianScene
 from cvtgs.rendering import render
 from cvtgs.train.cases import Case, MergedScene, describe_case
 from cvtgs.train.losses import TILE, CellGrid, lay_out_cells
-from mergenet_cases import Case as Cells
-from mergenet_cases import case_of, fields_of, lively_net
+from mergenet_cases import Case as Cells, case_of, fields_of, lively_net
 from scenes import covariances_of, random_scene
 from train_cases import small_net, some_case
 

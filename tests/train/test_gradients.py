@@ -8,8 +8,7 @@ import torch
 
 from cvtgs.errors import TrainingError
 from cvtgs.mergenet import load_checkpoint
-from cvtgs.train import TrainConfig, TrainFiles
-from cvtgs.train import loop as train_loop
+from cvtgs.train import TrainConfig, TrainFiles, loop as train_loop
 from cvtgs.train.cases import DeviceCopies
 from cvtgs.train.scenes import find_sources, prepare_scene
 from train_cases import bits_of, run, small_net, tiny_config, tiny_data, write_scenes

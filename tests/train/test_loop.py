@@ -19,8 +19,7 @@ from cvtgs.errors import (
 )
 from cvtgs.mergenet import load_checkpoint
 from cvtgs.progress import ProgressEvent
-from cvtgs.train import Gain, History, TrainConfig, TrainFiles, train
-from cvtgs.train import loop as train_loop
+from cvtgs.train import Gain, History, TrainConfig, TrainFiles, loop as train_loop, train
 from train_cases import bits_of, run, small_scene, tiny_config, tiny_data, write_scenes
 
 

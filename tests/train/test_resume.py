@@ -8,8 +8,7 @@ import torch
 from cvtgs.errors import CheckpointError
 from cvtgs.mergenet import load_checkpoint
 from cvtgs.progress import ProgressEvent
-from cvtgs.train import History, TrainConfig, TrainFiles
-from cvtgs.train import loop as train_loop
+from cvtgs.train import History, TrainConfig, TrainFiles, loop as train_loop
 from train_cases import (
     bits_of_state,
     needs_matplotlib,
