@@ -29,7 +29,7 @@ def main() -> None:
     measured = measure_tradeoff(
         options.input,
         presets=options.presets.split(","),
-        ratios=options.rho,
+        rhos=options.rho,
         cameras=partial(automatic_views, count=4, width=options.size, height=options.size),
         settings=EvaluationSettings(lpips="off"),
     )

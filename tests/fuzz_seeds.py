@@ -17,7 +17,7 @@ from camera_files import colmap_bin, colmap_txt, inria, transforms
 from cvtgs import SimplifyConfig
 from cvtgs.boxes import read_boxes
 from cvtgs.io.sog import encode_sog
-from cvtgs.mergenet import Architecture, CheckpointInfo, load_checkpoint, save_checkpoint
+from cvtgs.mergenet import Architecture, CheckpointInfo, encode_checkpoint, load_checkpoint
 from cvtgs.train import TrainConfig
 from mergenet_cases import lively_net
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
@@ -69,7 +69,7 @@ def seeds_of_checkpoints() -> list[bytes]:
     """Return one small checkpoint."""
     shape = Architecture(width=2, cell_width=3)
     info = CheckpointInfo(architecture=shape, preset="paper")
-    return [save_checkpoint(lively_net(torch.float32, architecture=shape), info)]
+    return [encode_checkpoint(lively_net(torch.float32, architecture=shape), info)]
 
 
 def seeds_of_configs() -> list[bytes]:

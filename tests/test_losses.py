@@ -195,7 +195,7 @@ def test_weights_out_of_range_are_refused() -> None:
     for weight in (-0.1, math.inf, math.nan, "a", None):
         with pytest.raises(InvalidArgumentError, match="gradient_weight must be a finite number"):
             image_loss(ZEROS, ZEROS, gradient_weight=weight)
-        for name in ("squared_weight", "image_weight", "ssim_weight"):
+        for name in ("mse_weight", "image_weight", "ssim_weight"):
             with pytest.raises(InvalidArgumentError, match=f"{name} must be a finite number"):
                 relative_loss(ZEROS, ZEROS, **{name: weight})
 
@@ -208,15 +208,15 @@ def test_gradients_match_finite_differences(loss) -> None:
 
 def test_the_relative_loss_by_hand() -> None:
     target = torch.full((1, 12, 12, 3), 0.4, dtype=torch.float64)
-    squared = relative_loss(target + 0.1, target, squared_weight=0.5, image_weight=0.0)
+    squared = relative_loss(target + 0.1, target, mse_weight=0.5, image_weight=0.0)
     assert squared.item() == pytest.approx(0.5 * math.log(0.01 + 1e-5))
-    both = relative_loss(target + 0.1, target, squared_weight=0.5, image_weight=2.0)
+    both = relative_loss(target + 0.1, target, mse_weight=0.5, image_weight=2.0)
     image = 2.0 * math.log(image_loss(target + 0.1, target).item() + 1e-3)
     assert both.item() == pytest.approx(squared.item() + image)
     whole = relative_loss(target + 0.1, target, image_weight=0.0, ssim_weight=0.3)
     structure = 0.3 * math.log(ssim_loss(target + 0.1, target).item() + 1e-3)
     assert whole.item() == pytest.approx(squared.item() + structure)
-    nothing = relative_loss(target + 0.1, target, squared_weight=0.0, image_weight=0.0)
+    nothing = relative_loss(target + 0.1, target, mse_weight=0.0, image_weight=0.0)
     assert nothing.item() == 0
 
 

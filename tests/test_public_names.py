@@ -189,7 +189,7 @@ STAGES = {
         "compose",
         "correct_cells",
         "load_checkpoint",
-        "save_checkpoint",
+        "encode_checkpoint",
         "summarize",
     },
     "matching": {
@@ -229,7 +229,6 @@ STAGES = {
         "LocalWorkers",
         "Workers",
         "connect",
-        "simplify_distributed",
         "simplify_file",
     },
     "synthetic": {"KINDS", "demo_scene", "scene"},

@@ -200,7 +200,7 @@ def relative_loss(
     prediction: Float[Tensor, "c h w 3"],
     target: Float[Tensor, "c h w 3"],
     *,
-    squared_weight: float = 0.5,
+    mse_weight: float = 0.5,
     image_weight: float = 0.5,
     ssim_weight: float = 0.0,
 ) -> Float[Tensor, ""]:
@@ -213,7 +213,7 @@ def relative_loss(
     Args:
         prediction: ``(c, h, w, 3)`` rendered images.
         target: ``(c, h, w, 3)`` target images.
-        squared_weight: ``w_s``, at least 0.
+        mse_weight: ``w_s``, at least 0.
         image_weight: ``w_i``, at least 0.
         ssim_weight: ``w_d``, at least 0.
 
@@ -230,15 +230,13 @@ def relative_loss(
         >>> round(relative_loss(grey, white, image_weight=0.0).item(), 3)
         -0.693
     """
-    _check_weights(
-        squared_weight=squared_weight, image_weight=image_weight, ssim_weight=ssim_weight
-    )
+    _check_weights(mse_weight=mse_weight, image_weight=image_weight, ssim_weight=ssim_weight)
     uses_ssim = bool(image_weight or ssim_weight)
     check_pair(prediction, target, least=SSIM_WINDOW if uses_ssim else 1)
     loss = prediction.new_zeros(len(prediction))
-    if squared_weight:
+    if mse_weight:
         squared = (prediction - target).square().mean(dim=(1, 2, 3))
-        loss = loss + squared_weight * positive_log(squared + SQUARED_FLOOR)
+        loss = loss + mse_weight * positive_log(squared + SQUARED_FLOOR)
     if not uses_ssim:
         return loss.mean()
     dissimilarity = 1 - _ssim(prediction, target)  # once: it takes longest

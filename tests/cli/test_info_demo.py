@@ -13,8 +13,8 @@ from cvtgs.mergenet import (
     CheckpointInfo,
     LearnedScene,
     MergeNet,
+    encode_checkpoint,
     load_checkpoint,
-    save_checkpoint,
 )
 
 
@@ -72,7 +72,7 @@ def test_info_shows_how_a_checkpoint_was_trained(tmp_path, capsys):
         architecture=Architecture(), preset="standard", training="a test", seed=7, steps=1200,
         version="0.2", config='{"seed":7}', start="cd" * 32, scenes=scenes,
     )  # fmt: skip
-    path.write_bytes(save_checkpoint(MergeNet(info.architecture), info))
+    path.write_bytes(encode_checkpoint(MergeNet(info.architecture), info))
     assert main(["info", str(path)]) == 0
     printed = capsys.readouterr().out.splitlines()
     for line in (

@@ -9,7 +9,7 @@ import torch
 import cvtgs
 from cvtgs.cli.main import main
 from cvtgs.errors import MissingDependencyError
-from cvtgs.mergenet import load_checkpoint, save_checkpoint
+from cvtgs.mergenet import encode_checkpoint, load_checkpoint
 from cvtgs.train import Gain, History, Validation, loop as train_loop
 from train_cases import needs_matplotlib, write_scenes
 
@@ -242,7 +242,7 @@ def lively(made, tmp_path) -> Path:
     checkpoint = load_checkpoint(made / "net.safetensors")
     path = tmp_path / "paper-like.safetensors"
     info = checkpoint.info.model_copy(update={"preset": "paper"})
-    path.write_bytes(save_checkpoint(checkpoint.net, info))
+    path.write_bytes(encode_checkpoint(checkpoint.net, info))
     return path
 
 

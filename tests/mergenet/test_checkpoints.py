@@ -17,8 +17,8 @@ from cvtgs.mergenet import (
     CheckpointInfo,
     MergeNet,
     checkpoint,
+    encode_checkpoint,
     load_checkpoint,
-    save_checkpoint,
 )
 from cvtgs.mergenet.checkpoint import LARGEST_FILE
 from cvtgs.mergenet.model import SUMMARY_FEATURES
@@ -37,7 +37,7 @@ def path(tmp_path) -> Path:
 
 def content_of(said: CheckpointInfo = INFO, /, **changes: str | None) -> bytes:
     """Return a checkpoint with other texts in its header; None leaves one out."""
-    original = save_checkpoint(lively_net(torch.float32, architecture=said.architecture), said)
+    original = encode_checkpoint(lively_net(torch.float32, architecture=said.architecture), said)
     length = int.from_bytes(original[:8], "little")
     header = json.loads(original[8 : 8 + length])
     texts = header["__metadata__"] | changes
@@ -63,7 +63,7 @@ def refusal(path: Path, content: bytes | None = None) -> str:
 def test_saving_and_loading_gives_the_same_network(path, architecture):
     net = lively_net(torch.float32, architecture=architecture)
     info = INFO.model_copy(update={"architecture": architecture})
-    path.write_bytes(save_checkpoint(net, info))
+    path.write_bytes(encode_checkpoint(net, info))
     loaded = load_checkpoint(path)
     assert loaded.info == info
     assert loaded.name == str(path)
@@ -87,19 +87,19 @@ def test_a_loaded_network_is_ready_for_inference(path):
 
 def test_the_same_network_gives_the_same_bytes(path):
     net = lively_net(torch.float32, architecture=SMALL)
-    contents = {save_checkpoint(net, INFO) for _ in range(20)}
+    contents = {encode_checkpoint(net, INFO) for _ in range(20)}
     assert len(contents) == 1
     path.write_bytes(contents.pop())
     loaded = load_checkpoint(path)
-    assert save_checkpoint(loaded.net, loaded.info) == path.read_bytes()
-    assert save_checkpoint(net.double(), INFO) == path.read_bytes()
+    assert encode_checkpoint(loaded.net, loaded.info) == path.read_bytes()
+    assert encode_checkpoint(net.double(), INFO) == path.read_bytes()
 
 
 def test_other_weights_or_descriptions_give_other_digests(path):
     digests = set()
     for seed, steps in ((0, 12), (1, 12), (0, 13)):
         net = lively_net(torch.float32, seed=seed, architecture=SMALL)
-        path.write_bytes(save_checkpoint(net, INFO.model_copy(update={"steps": steps})))
+        path.write_bytes(encode_checkpoint(net, INFO.model_copy(update={"steps": steps})))
         digests.add(load_checkpoint(path).digest)
     assert len(digests) == 3
     assert {len(digest) for digest in digests} == {64}
@@ -124,7 +124,7 @@ def test_shipped_checkpoints_are_small_and_described(name, path):
     assert found.name == found.info.preset == name
     assert found.info.training
     # Files of the first format are saved in the current one, with a known range.
-    path.write_bytes(save_checkpoint(found.net, found.info))
+    path.write_bytes(encode_checkpoint(found.net, found.info))
     again = load_checkpoint(path)
     assert again.info == found.info
     ours, theirs = found.net.state_dict(), again.net.state_dict()
@@ -135,7 +135,7 @@ def test_shipped_checkpoints_are_small_and_described(name, path):
 def test_every_flipped_bit_is_detected(path):
     """A random bit of every byte is flipped: in header, texts and weights."""
     net, dice = lively_net(torch.float32, architecture=SMALL), random.Random(0)
-    content = save_checkpoint(net, INFO)
+    content = encode_checkpoint(net, INFO)
     for place in range(len(content)):
         damaged = bytearray(content)
         damaged[place] ^= 1 << dice.randrange(8)
@@ -222,7 +222,7 @@ def test_other_numbers_of_features_are_refused(path, feature):
 
 def test_weights_of_another_shape_are_refused(path):
     wider = lively_net(torch.float32, architecture=Architecture(width=3, cell_width=3))
-    assert refusal(path, save_checkpoint(wider, INFO)) == (
+    assert refusal(path, encode_checkpoint(wider, INFO)) == (
         "the checkpoint has a different architecture: cell_layers.0.weight, "
         "member_gates.cell.weight, member_gates.gates.weight do not fit."
     )
@@ -237,7 +237,7 @@ class Other(torch.nn.Module):
 
 
 def test_weights_of_another_network_are_refused(path):
-    text = refusal(path, save_checkpoint(Other(), INFO))
+    text = refusal(path, encode_checkpoint(Other(), INFO))
     assert text.startswith("the checkpoint has a different architecture: ")
     assert text.endswith(" do not fit.")
 
@@ -247,7 +247,7 @@ def test_weights_that_are_not_finite_are_refused(path, value):
     net = lively_net(torch.float32, architecture=SMALL)
     with torch.no_grad():
         net.decoder.bias[2] = value
-    assert refusal(path, save_checkpoint(net, INFO)) == (
+    assert refusal(path, encode_checkpoint(net, INFO)) == (
         "the checkpoint holds weights that are not finite."
     )
 
@@ -275,7 +275,7 @@ def test_a_huge_file_is_not_read(path):
 
 
 def test_an_untrained_network_is_a_valid_checkpoint(path):
-    path.write_bytes(save_checkpoint(MergeNet(SMALL), INFO))
+    path.write_bytes(encode_checkpoint(MergeNet(SMALL), INFO))
     assert load_checkpoint(path).info == INFO
 
 

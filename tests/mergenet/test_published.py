@@ -19,8 +19,8 @@ from cvtgs.mergenet import (
     PublishedArchitecture,
     PublishedMergeNet,
     correct_cells,
+    encode_checkpoint,
     load_checkpoint,
-    save_checkpoint,
 )
 from cvtgs.mergenet.apply import compose_published
 from cvtgs.mergenet.published import describe_published
@@ -205,7 +205,7 @@ def test_coincident_members_of_a_tiny_cell_are_in_its_middle():
 
 def test_saving_and_loading_keeps_the_kind(tmp_path):
     path, net = tmp_path / "net.safetensors", lively(torch.float32)
-    path.write_bytes(save_checkpoint(net, INFO))
+    path.write_bytes(encode_checkpoint(net, INFO))
     found = load_checkpoint(path)
     assert isinstance(found.net, PublishedMergeNet)
     assert found.info == INFO
@@ -215,7 +215,7 @@ def test_saving_and_loading_keeps_the_kind(tmp_path):
 
 def refusal(tmp_path, net: torch.nn.Module, info: CheckpointInfo) -> str:
     path = tmp_path / "net.safetensors"
-    path.write_bytes(save_checkpoint(net, info))
+    path.write_bytes(encode_checkpoint(net, info))
     with pytest.raises(CheckpointError) as caught:
         load_checkpoint(path)
     return str(caught.value).removeprefix(f"{path}: ")
@@ -259,13 +259,13 @@ def test_files_of_the_first_release_are_of_the_gated_kind(tmp_path):
     told = json.loads(info.model_dump_json())
     del told["architecture"]["kind"]
     assert CheckpointInfo.model_validate(told) == info
-    path.write_bytes(save_checkpoint(gated, info))
+    path.write_bytes(encode_checkpoint(gated, info))
     assert load_checkpoint(path).info.architecture.kind == "gated"
 
 
 def test_a_simplified_scene_keeps_its_count(tmp_path):
     path = tmp_path / "net.safetensors"
-    path.write_bytes(save_checkpoint(lively(torch.float32, scale=0.1), INFO))
+    path.write_bytes(encode_checkpoint(lively(torch.float32, scale=0.1), INFO))
     scene = cvtgs.synthetic.scene("object", 400, sh_degree=1, seed=0)
     simplified = cvtgs.Simplifier(path, config="paper").simplify(scene, 0.1)
     merged = cvtgs.Simplifier(None, config="paper").simplify(scene, 0.1)
@@ -280,7 +280,7 @@ def test_the_paper_preset_does_not_align_axes():
 
 def test_no_neighbours_are_searched(tmp_path, monkeypatch):
     path = tmp_path / "net.safetensors"
-    path.write_bytes(save_checkpoint(lively(torch.float32, scale=0.1), INFO))
+    path.write_bytes(encode_checkpoint(lively(torch.float32, scale=0.1), INFO))
     asked = []
     nearest = cvtgs.pipeline.cvt.nearest_neighbors
     monkeypatch.setattr(

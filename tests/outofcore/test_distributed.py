@@ -14,8 +14,7 @@ import pytest
 import cvtgs
 from cvtgs.cli.main import main
 from cvtgs.errors import InvalidSceneError, MissingDependencyError, RunError
-from cvtgs.outofcore import ClusterWorkers, distributed, simplify_distributed, simplify_file
-from cvtgs.outofcore.distributed import connect
+from cvtgs.outofcore import ClusterWorkers, connect, distributed, simplify_file
 
 BLOCKS = 10
 
@@ -51,9 +50,9 @@ def test_a_killed_worker_does_not_change_the_output(cluster, source, tmp_path):
             os.kill(killed[0], signal.SIGKILL)
 
     with Client(cluster) as client:
-        report = simplify_distributed(
-            source, 0.05, client,
-            output=together, blocks=BLOCKS, range_rows=6000, listener=kill_one,
+        report = simplify_file(
+            source, together, 0.05,
+            workers=ClusterWorkers(client), blocks=BLOCKS, range_rows=6000, listener=kill_one,
         )  # fmt: skip
     assert killed
     assert report.output_count == 1000
@@ -80,9 +79,10 @@ def test_without_the_package_the_error_says_what_to_install(monkeypatch):
 @pytest.mark.filterwarnings("ignore")
 def test_a_relative_path_starts_at_the_folder_of_the_caller(cluster, source, tmp_path, monkeypatch):
     monkeypatch.chdir(source.parent)
-    report = simplify_distributed(
-        source.name, 0.01, cluster.scheduler_address, output=tmp_path / "out.ply", blocks=3
-    )
+    with connect(cluster.scheduler_address) as client:
+        report = simplify_file(
+            source.name, tmp_path / "out.ply", 0.01, workers=ClusterWorkers(client), blocks=3
+        )
     assert report.output_count == 200
     assert report.stages[0].stage == "workers"
 
@@ -94,9 +94,10 @@ def test_a_cluster_without_workers_is_an_error(source, tmp_path, monkeypatch):
     monkeypatch.setattr(distributed, "ANSWER_SECONDS", 1.0)
     with (
         package.LocalCluster(n_workers=0, dashboard_address=None) as empty,
+        connect(empty.scheduler_address) as client,
         pytest.raises(RunError, match="must have workers, found none within 1 s; start some with"),
     ):
-        simplify_distributed(source, 0.01, empty.scheduler_address, output=tmp_path / "out.ply")
+        simplify_file(source, tmp_path / "out.ply", 0.01, workers=ClusterWorkers(client))
 
 
 class Answers:

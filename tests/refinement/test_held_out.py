@@ -157,7 +157,7 @@ def test_an_equal_scene_looks_equal_over_every_background(monkeypatch):
     errors, means, weights = zip(*seen, strict=True)
     assert max(errors) < 2e-3
     assert len(set(means)) == 4
-    assert weights == ({"squared_weight": 0.2, "image_weight": 0.7},) * 4
+    assert weights == ({"mse_weight": 0.2, "image_weight": 0.7},) * 4
 
 
 def test_old_images_leave_the_buffer_in_random_order():

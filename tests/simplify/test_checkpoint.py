@@ -16,8 +16,8 @@ from cvtgs.mergenet import (
     CheckpointInfo,
     MergeNet,
     correct_cells,
+    encode_checkpoint,
     load_checkpoint,
-    save_checkpoint,
 )
 from cvtgs.pipeline import reduce_scene
 from cvtgs.train.cases import merge_scene
@@ -30,7 +30,7 @@ each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])
 
 def saved(path: Path, net: MergeNet, preset: str = "standard") -> Path:
     info = CheckpointInfo(architecture=net.architecture, preset=preset)
-    path.write_bytes(save_checkpoint(net, info))
+    path.write_bytes(encode_checkpoint(net, info))
     return path
 
 

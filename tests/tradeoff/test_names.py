@@ -30,9 +30,7 @@ def test_a_result_does_not_replace_the_scene_that_later_presets_read(tmp_path, s
     cvtgs.save(scene, file)
     before = file.read_bytes()
     with pytest.raises(InvalidArgumentError, match=r"draft_0\.1\.ply: a result must not replace"):
-        measure_tradeoff(
-            file, presets=["fast", "draft"], ratios=[0.1], cameras=look, folder=tmp_path
-        )
+        measure_tradeoff(file, presets=["fast", "draft"], rhos=[0.1], cameras=look, folder=tmp_path)
     assert file.read_bytes() == before
     assert list(tmp_path.iterdir()) == [file]
 
@@ -75,6 +73,6 @@ def test_names_may_begin_with_a_dash(tmp_path, scene, monkeypatch):
 def test_a_name_that_is_not_utf8_is_escaped(tmp_path, scene):
     file = tmp_path / "in\udcff.ply"
     cvtgs.save(scene, file)
-    found = measure_tradeoff(file, presets=["draft"], ratios=[0.1], cameras=look).tradeoff
+    found = measure_tradeoff(file, presets=["draft"], rhos=[0.1], cameras=look).tradeoff
     assert found.source == found.evaluation.reference == "in\\udcff.ply"
     assert json.loads(found.to_json())["source"] == found.source

@@ -281,7 +281,7 @@ def test_the_size_of_a_folder_is_that_of_its_scene(tmp_path, monkeypatch):
     found = measure_tradeoff(
         tmp_path,
         presets=["draft"],
-        ratios=[0.1],
+        rhos=[0.1],
         cameras=lambda scene: automatic_views(scene, 1, width=32, height=24),
         settings=EvaluationSettings(lpips="off"),
     )
@@ -333,7 +333,7 @@ def page(tmp_path_factory):
     measured = measure_tradeoff(
         folder / "full.ply",
         presets=["draft", "fast"],
-        ratios=[0.1],
+        rhos=[0.1],
         cameras=lambda scene: automatic_views(scene, 2, width=64, height=48),
         settings=EvaluationSettings(lpips="off"),
     )

@@ -17,7 +17,7 @@ from cvtgs.mergenet import (
     CheckpointInfo,
     LearnedScene,
     MergeNet,
-    save_checkpoint,
+    encode_checkpoint,
 )
 from cvtgs.train import DataConfig, Gain, History, LossConfig, TrainConfig, Validation
 from cvtgs.train.state import TrainState
@@ -169,7 +169,7 @@ def test_the_start_may_move_but_not_change(tmp_path):
     path, starts = tmp_path / "a.state", [tmp_path / f"{name}.safetensors" for name in "abc"]
     for seed, start in zip((0, 0, 1), starts, strict=True):
         info = CheckpointInfo(architecture=small_net().architecture, preset="standard", seed=seed)
-        start.write_bytes(save_checkpoint(small_net(), info))
+        start.write_bytes(encode_checkpoint(small_net(), info))
     first, moved, other = (CONFIG.model_copy(update={"start": start}) for start in starts)
     TrainState(small_net(), first).save(path, first)
     TrainState(small_net(), moved).load(path, moved)

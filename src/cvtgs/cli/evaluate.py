@@ -67,7 +67,7 @@ def render(options: argparse.Namespace) -> None:
     make_folder(options.output)
     paths = [options.output / name for name in file_names(cameras.view_names)]
     for path in paths:
-        cvtgs.io.check_output(path, options.overwrite)
+        cvtgs.io.check_output(path, overwrite=options.overwrite)
     most_seen = 0.0
     with progress_bars(quiet=options.quiet) as listener, torch.no_grad():
         for number, (path, camera) in enumerate(zip(paths, cameras.singles(), strict=True)):
@@ -296,7 +296,7 @@ def tradeoff(options: argparse.Namespace) -> None:
         measured = cvtgs.tradeoff.measure_tradeoff(
             options.input,
             presets=presets,
-            ratios=options.rho,
+            rhos=options.rho,
             cameras=lambda scene: choose_cameras(options, scene, most=MOST_CAMERAS, held_out=True),
             photographs=None if options.images is None else partial(read_photographs, options),
             settings=evaluation_settings(options),
@@ -319,7 +319,7 @@ def tradeoff(options: argparse.Namespace) -> None:
 def _print_tradeoff(tradeoff: "Tradeoff") -> None:
     from cvtgs.tradeoff.files import MARK_MEANS, cells, heading, how_measured
 
-    for rho in tradeoff.ratios:
+    for rho in tradeoff.rhos:
         say(heading(tradeoff, rho))
         runs = [cells(tradeoff, result) for result in tradeoff.results if result.rho == rho]
         say_table([[name, *(run[name] for run in runs)] for name in runs[0]])

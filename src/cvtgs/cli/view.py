@@ -84,7 +84,7 @@ def check_page(options: argparse.Namespace) -> None:
     if options.viewer:
         check_viewer()
         if options.output.exists():
-            cvtgs.io.check_output(options.output / PAGE, options.overwrite)
+            cvtgs.io.check_output(options.output / PAGE, overwrite=options.overwrite)
 
 
 def write_page(options: argparse.Namespace, scenes: "Mapping[str, GaussianScene]") -> None:
@@ -117,7 +117,7 @@ def view(options: argparse.Namespace) -> None:
     small = expanded(options.small)
     names = [options.input, *small]
     if options.page is not None:
-        cvtgs.io.check_output(options.page, options.overwrite)
+        cvtgs.io.check_output(options.page, overwrite=options.overwrite)
         if any(is_same_file(options.page, path) for path in names):
             raise InvalidArgumentError(
                 f"--page and the scenes must be different files, found {options.page} for both."

@@ -61,7 +61,7 @@ def embed(
 
 @checked
 def gaussian_weights(
-    opacities: Float[Tensor, "n"], areas: Float[Tensor, "n"], area_power: float
+    opacities: Float[Tensor, "n"], areas: Float[Tensor, "n"], *, area_power: float
 ) -> Float[Tensor, "n"]:
     """Return opacity times area to a power: 0 is the opacity as in CVT-GS, 1 the mass.
 
@@ -77,7 +77,7 @@ def gaussian_weights(
         Weights in float64.
 
     Example:
-        >>> gaussian_weights(torch.tensor([0.5]), torch.tensor([4.0]), 0.5).tolist()
+        >>> gaussian_weights(torch.tensor([0.5]), torch.tensor([4.0]), area_power=0.5).tolist()
         [1.0]
     """
     weights = opacities.double()
@@ -109,7 +109,7 @@ def tessellation_weights(
         [0.5, 1.5]
     """
     largest_area = areas.amax().clamp_min(torch.finfo(torch.float64).tiny)
-    raw = gaussian_weights(opacities, areas / largest_area, area_power)
+    raw = gaussian_weights(opacities, areas / largest_area, area_power=area_power)
     largest = raw.amax()
     scaled = raw / largest
     return torch.where(largest > 0, (scaled / scaled.mean()).clamp_min(floor), 1.0)

@@ -53,7 +53,7 @@ def check_comparison_files(folder: str | os.PathLike[str], *, overwrite: bool = 
     """Make the folder and check that the files can be written, before the work starts."""
     make_folder(folder)
     for name in (PAGE, SHEET, ERRORS):
-        check_output(Path(folder) / name, overwrite)
+        check_output(Path(folder) / name, overwrite=overwrite)
 
 
 def write_comparison(

@@ -42,7 +42,7 @@ _WAITS = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Seconds to wait on Windows for programs that hold a file for a moment, such as virus scanners."""
 
 
-def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
+def check_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
     """Check that a file could be written, before its content is computed.
 
     Args:
@@ -118,7 +118,7 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
         ...     (Path(folder) / "note.txt").read_text()
         'done'
     """
-    check_output(path, overwrite)
+    check_output(path, overwrite=overwrite)
     target = _target(path)
     temporary, file = None, None
     try:

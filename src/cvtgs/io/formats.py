@@ -249,7 +249,7 @@ def save(
     if spz_version != 3 and suffix != ".spz":
         raise InvalidArgumentError(f"spz_version needs an .spz to write, found {named}.")
     if isinstance(path, str | os.PathLike):
-        check_output(path, overwrite)
+        check_output(path, overwrite=overwrite)
     axes = _FILE_AXES.get(suffix, SCENE_AXES) if axes is None else axes
     scene = change_axes(scene, SCENE_AXES, axes)
     scene = scene if suffix == ".ply" else tagged_if_flat(scene)
@@ -320,7 +320,7 @@ def check_save(path: str | os.PathLike[str], overwrite: bool = False) -> None:
     """
     check_path(path)
     _suffix_of(path, _WRITERS)
-    check_output(path, overwrite)
+    check_output(path, overwrite=overwrite)
 
 
 def _dotted(suffix: str | None) -> str | None:

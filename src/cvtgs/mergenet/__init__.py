@@ -6,8 +6,8 @@ from cvtgs.mergenet.checkpoint import (
     Checkpoint,
     CheckpointInfo,
     LearnedScene,
+    encode_checkpoint,
     load_checkpoint,
-    save_checkpoint,
 )
 from cvtgs.mergenet.model import (
     Architecture,
@@ -42,7 +42,7 @@ __all__ = [
     "Residuals",
     "compose",
     "correct_cells",
+    "encode_checkpoint",
     "load_checkpoint",
-    "save_checkpoint",
     "summarize",
 ]

@@ -147,7 +147,7 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
     )
 
 
-def save_checkpoint(net: Net, info: CheckpointInfo) -> bytes:
+def encode_checkpoint(net: Net, info: CheckpointInfo) -> bytes:
     """Return the bytes of a checkpoint file.
 
     The same network and description give the same bytes.
@@ -161,7 +161,7 @@ def save_checkpoint(net: Net, info: CheckpointInfo) -> bytes:
 
     Example:
         >>> info = CheckpointInfo(architecture=Architecture(), preset="standard")
-        >>> len(save_checkpoint(MergeNet(info.architecture), info)) < 200_000
+        >>> len(encode_checkpoint(MergeNet(info.architecture), info)) < 200_000
         True
     """
     tensors = {

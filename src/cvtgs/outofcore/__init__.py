@@ -1,6 +1,6 @@
 """Simplify scenes that do not fit into memory in blocks of space, here or on a cluster."""
 
-from cvtgs.outofcore.distributed import ClusterWorkers, connect, simplify_distributed
+from cvtgs.outofcore.distributed import ClusterWorkers, connect
 from cvtgs.outofcore.run import simplify_file
 from cvtgs.processes import LocalWorkers, Workers
 
@@ -9,6 +9,5 @@ __all__ = [
     "LocalWorkers",
     "Workers",
     "connect",
-    "simplify_distributed",
     "simplify_file",
 ]

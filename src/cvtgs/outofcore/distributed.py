@@ -7,7 +7,7 @@ import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,9 +23,7 @@ from cvtgs.errors import (
     is_out_of_memory,
 )
 from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.run import simplify_file
 from cvtgs.processes import Item, Result
-from cvtgs.report import SimplifyReport
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -36,43 +34,6 @@ ANSWER_SECONDS = 30.0
 """Seconds in which a scheduler must answer, a first worker appear, or a worker answer a check."""
 
 _SHARE_SECONDS = 10.0  # seconds that a shared disk may take to show a new file to a worker
-
-
-def simplify_distributed(
-    source: str | os.PathLike[str],
-    rho: float,
-    client: "Client | str",
-    *,
-    output: str | os.PathLike[str] | None = None,
-    **options: Any,
-) -> SimplifyReport:
-    """Simplify a file on the workers of a Dask cluster.
-
-    The result has the same bits as that of :func:`cvtgs.outofcore.simplify_file` with the same
-    number of blocks, on processors of one kind. Ranges of the file and blocks are tasks of a few
-    seconds to minutes each, which exchange data only through files in the folder beside the output.
-    Every worker must see source and output under the same path. If a worker dies, its tasks rerun.
-
-    Args:
-        source: A binary PLY file.
-        rho: Ratio of Gaussians to keep, in (0, 1].
-        client: A client of the cluster, or the address of its scheduler.
-        output: The file to write; None writes ``<stem>_rho<rho>.ply`` beside the source.
-        **options: Options of :func:`cvtgs.outofcore.simplify_file`; ``memory`` is per task.
-
-    Returns:
-        The report.
-
-    Raises:
-        MissingDependencyError: ``distributed`` is not installed.
-        RunError: The scheduler does not answer, its workers cannot do the job (no access, another
-            version), or a task fails repeatedly.
-        CvtgsError: Any other error of :func:`cvtgs.outofcore.simplify_file`.
-    """
-    if output is None:
-        output = Path(source).with_name(f"{Path(source).stem}_rho{rho:g}.ply")
-    with connect(client) if isinstance(client, str) else nullcontext(client) as found:
-        return simplify_file(source, output, rho, workers=ClusterWorkers(found), **options)
 
 
 def connect(address: str) -> "Client":

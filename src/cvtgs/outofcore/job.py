@@ -24,7 +24,7 @@ from cvtgs.io.atomic import write_atomically
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors, save_tensors
-from cvtgs.mergenet import Checkpoint, Net, load_checkpoint, save_checkpoint
+from cvtgs.mergenet import Checkpoint, Net, encode_checkpoint, load_checkpoint
 from cvtgs.outofcore.memory import CELL_ROOM
 from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, write_scan
 
@@ -198,7 +198,7 @@ class Job:
 
     def write_network(self, checkpoint: Checkpoint) -> None:
         """Write the checkpoint to the folder of the job."""
-        content = save_checkpoint(checkpoint.net, checkpoint.info)
+        content = encode_checkpoint(checkpoint.net, checkpoint.info)
         self.write_file("network.safetensors", content)
 
     def read_scan(self) -> SceneScan:

@@ -190,7 +190,7 @@ def _embedded_rows(
     rows = order.long()
     points = embed_rows(scene, rows, analysis, job.read_manifest().total, job.config)
     config = job.config.cvt
-    weights = gaussian_weights(analysis.opacities[rows], areas[rows], config.area_power)
+    weights = gaussian_weights(analysis.opacities[rows], areas[rows], area_power=config.area_power)
     weights = (weights / scan.mean_weight).clamp_min(config.weight_floor)
     return order, points, weights
 

@@ -278,7 +278,7 @@ def scan_scene(
     no_flyaways = config.filter.model_copy(update={"max_flyaway_share": 0.0})
     rows = filters.filter_rows(sample, known, least, no_flyaways).rows
     power = config.cvt.area_power
-    weights = cvt.gaussian_weights(known.opacities, known.apparent_areas, power)[rows]
+    weights = cvt.gaussian_weights(known.opacities, known.apparent_areas, area_power=power)[rows]
     mean_weight = float(weights.mean()) or 1.0
     weights = weights.clamp_min(mean_weight * config.cvt.weight_floor)
     cell_weight = _cell_weight(weights, cell_count / rows_per_sample)

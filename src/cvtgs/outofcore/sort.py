@@ -195,7 +195,7 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
         if len(chosen) < len(free):
             masses = scene.masses
             left_out.append(float(masses[free].sum() - masses[chosen].sum()))
-        weights = cvt.gaussian_weights(scene.opacities[chosen], areas, config.area_power)
+        weights = cvt.gaussian_weights(scene.opacities[chosen], areas, area_power=config.area_power)
         weights = weights.clamp_min(scan.mean_weight * config.weight_floor)
         per_cell = scan.cell_weight
         cells = (weights / per_cell).clamp_max(1.0) if per_cell > 0 else torch.ones_like(weights)

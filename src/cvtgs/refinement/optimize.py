@@ -168,7 +168,7 @@ def mean_loss(scene: GaussianScene, images: ImageBuffer, config: RefineConfig) -
         part = relative_loss(
             image,
             targets.over(backgrounds),
-            squared_weight=config.mse_weight,
+            mse_weight=config.mse_weight,
             image_weight=config.image_weight,
         )
         loss = loss + part * (len(targets.rgb) / config.images_per_step)

@@ -188,7 +188,7 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
         check_output(place)  # checks that its parent exists and is writable
         return
     index = place / INDEX_NAMES[kind]
-    check_output(index, overwrite)
+    check_output(index, overwrite=overwrite)
     # Hidden files do not matter: locks are such.
     if not index.exists() and any(not path.name.startswith(".") for path in place.iterdir()):
         raise OutputExistsError(

@@ -78,7 +78,7 @@ def check_tradeoff_files(
     """Make the folder and check that the files can be written, before the work starts."""
     make_folder(folder)
     for name in (CSV, JSON, PLOT, PAGE, *more):
-        check_output(Path(folder) / name, overwrite)
+        check_output(Path(folder) / name, overwrite=overwrite)
 
 
 def write_tradeoff(
@@ -137,7 +137,7 @@ def tradeoff_chart(tradeoff: Tradeoff) -> bytes:
     panels = []
     for metric in ("psnr", "ssim"):
         series = []
-        for rho in tradeoff.ratios:
+        for rho in tradeoff.rhos:
             results = [result for result in tradeoff.results if result.rho == rho]
             results.sort(key=lambda result: result.seconds)
             series.append(
@@ -181,7 +181,7 @@ def page_summary(tradeoff: Tradeoff, chart: bytes | None) -> str:
     """Return the plot and the table as HTML."""
     headings = list(cells(tradeoff, tradeoff.results[0]))
     groups = []
-    for rho in tradeoff.ratios:
+    for rho in tradeoff.rhos:
         rows = [cells(tradeoff, result) for result in tradeoff.results if result.rho == rho]
         texts = [[row[name].strip() for name in headings] for row in rows]
         groups.append((heading(tradeoff, rho), texts))

@@ -76,7 +76,7 @@ class Run:
     report: SimplifyReport
 
 
-def tasks_of(presets: Sequence[str] | None, ratios: Sequence[float]) -> tuple[Task, ...]:
+def tasks_of(presets: Sequence[str] | None, rhos: Sequence[float]) -> tuple[Task, ...]:
     """Check presets and ratios, and list the runs, ratio by ratio."""
     if isinstance(presets, str) or not isinstance(presets, Sequence | None):
         raise InvalidArgumentError(f"presets must be a list of names, found {shown(presets)}.")
@@ -84,7 +84,7 @@ def tasks_of(presets: Sequence[str] | None, ratios: Sequence[float]) -> tuple[Ta
     for name in names:
         if name not in PRESETS:
             raise unknown_preset(name)
-    tasks = tuple(Task(preset=name, rho=rho) for rho in written_ratios(ratios) for name in names)
+    tasks = tuple(Task(preset=name, rho=rho) for rho in written_ratios(rhos) for name in names)
     if not tasks:
         raise InvalidArgumentError("give at least one preset and one ratio.")
     twice = [task.name for number, task in enumerate(tasks) if task in tasks[:number]]
@@ -159,7 +159,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
     source: str | os.PathLike[str],
     *,
     presets: Sequence[str] | None = None,
-    ratios: Sequence[float] = RATIOS,
+    rhos: Sequence[float] = RATIOS,
     cameras: CameraChoice = automatic_views,
     photographs: PhotographChoice | None = None,
     settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
@@ -184,7 +184,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
     Args:
         source: The full scene.
         presets: Names of presets; None for all, from the fastest to the best.
-        ratios: Ratios of Gaussians to keep, each in (0, 1].
+        rhos: Ratios of Gaussians to keep, each in (0, 1].
         cameras: Returns the views of the scene.
         photographs: Returns their photographs, to score all scenes against too; None for none.
         settings: Background, LPIPS network and backend.
@@ -211,11 +211,11 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         >>> with TemporaryDirectory() as name:
         ...     path = Path(name) / "full.ply"
         ...     save(make("object", 500, sh_degree=0), path)
-        ...     found = measure_tradeoff(path, presets=["standard"], ratios=[0.1], cameras=look)
+        ...     found = measure_tradeoff(path, presets=["standard"], rhos=[0.1], cameras=look)
         >>> [(result.name, result.count) for result in found.tradeoff.results]
         [('standard 0.1', 50)]
     """
-    tasks = tasks_of(presets, ratios)
+    tasks = tasks_of(presets, rhos)
     check_listener(listener)
     if not callable(cameras):
         raise InvalidArgumentError(

@@ -91,7 +91,7 @@ class Tradeoff(Record):
     held_out: bool = False
 
     @property
-    def ratios(self) -> tuple[float, ...]:
+    def rhos(self) -> tuple[float, ...]:
         """The ratios, in the order of the results."""
         return tuple(dict.fromkeys(result.rho for result in self.results))
 

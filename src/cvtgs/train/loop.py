@@ -33,8 +33,8 @@ from cvtgs.mergenet import (
     Net,
     PublishedArchitecture,
     PublishedMergeNet,
+    encode_checkpoint,
     load_checkpoint,
-    save_checkpoint,
     summarize,
 )
 from cvtgs.mergenet.checkpoint import build_network
@@ -379,4 +379,4 @@ def _write_checkpoint(state: TrainState, config: TrainConfig, files: TrainFiles)
         start=state.start,
         scenes=state.scenes,
     )
-    write_atomically(files.checkpoint, save_checkpoint(state.mean_net, info), overwrite=True)
+    write_atomically(files.checkpoint, encode_checkpoint(state.mean_net, info), overwrite=True)

@@ -187,7 +187,7 @@ def view_loss(
     return relative_loss(
         image,
         target,
-        squared_weight=config.mse_weight,
+        mse_weight=config.mse_weight,
         image_weight=config.image_weight,
         ssim_weight=config.ssim_weight,
     )
