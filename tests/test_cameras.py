@@ -198,6 +198,7 @@ def test_targets_may_be_at_any_distance(size):
         ([[0.0, 0, 0]], torch.ones(1, 3), "eyes must be a tensor of floats of shape (c, 3), found"),
         (torch.zeros(1, 3).int(), torch.ones(1, 3), "found torch.int32 of shape (1, 3)."),
         (torch.zeros(2, 4), torch.ones(2, 4), "found torch.float32 of shape (2, 4)."),
+        (torch.zeros(1, 3), torch.ones(3), "targets must be a tensor of floats of shape (1, 3), f"),
     ],
 )
 def test_wrong_positions(eyes, targets, text):

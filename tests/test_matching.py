@@ -395,6 +395,8 @@ def test_arguments_that_do_not_fit_are_refused(scene, views, changes, text):
 
 def test_contributions_must_cover_all_members():
     cells = Partition.from_labels(torch.tensor([1, 0, 1]), 2)
-    for wrong in (torch.ones(2), torch.ones(3, 1)):
-        with pytest.raises(InvalidArgumentError, match="at least the 3 in cells; found shape"):
+    with pytest.raises(InvalidArgumentError, match="at least the 3 in cells; found shape"):
+        cell_contributions(torch.ones(2), cells)
+    for wrong in (torch.ones(3, 1), torch.ones(3, dtype=torch.int64)):
+        with pytest.raises(InvalidArgumentError, match="must be a tensor of floats of shape"):
             cell_contributions(wrong, cells)

@@ -8,6 +8,7 @@ import pydantic
 import pytest
 import torch
 
+import cvtgs
 from cvtgs import (
     Cameras,
     ProgressEvent,
@@ -113,6 +114,7 @@ def test_json_holds_every_field():
     assert values["plan"]["unbounded"]["active"] in (True, False)
     assert [stage["stage"] for stage in values["stages"]][-2:] == ["merge", "network"]
     assert values["checkpoint"] == "standard"
+    assert values["version"] == cvtgs.__version__
     assert report.to_json().endswith("}\n")
 
 

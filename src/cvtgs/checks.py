@@ -45,7 +45,8 @@ def check_kinds(kinds: Mapping[str, Any], values: Mapping[str, object]) -> None:
         for name, value in values.items():
             kind = kinds.get(name, object)
             if not isinstance(value, kind):
-                wanted = " or ".join(_in_words(one, sizes) for one in get_args(kind) or [kind])
+                accepted = get_args(kind) or [kind]
+                wanted = " or ".join(dict.fromkeys(_in_words(one, sizes) for one in accepted))
                 raise InvalidArgumentError(f"{name} must be {wanted}, found {_found(value)}.")
             if isinstance(value, Tensor):
                 letters = getattr(kind, "dim_str", "").split()

@@ -122,6 +122,14 @@ def check_share(value: object, name: str) -> None:
         raise InvalidArgumentError(f"{name} must be a number from 0 to 1, found {shown(value)}.")
 
 
+def check_not_negative(value: object, name: str) -> None:
+    """Raise unless a value is a finite number of at least 0."""
+    if not 0.0 <= real_number(value) < math.inf:
+        raise InvalidArgumentError(
+            f"{name} must be a finite number of at least 0, found {shown(value)}."
+        )
+
+
 def is_truth_value(value: object) -> bool:
     """Check whether a value is True or False, also one of numpy or torch."""
     return "bool" in type(value).__name__ or "bool" in str(getattr(value, "dtype", ""))

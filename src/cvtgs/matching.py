@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Partition
+from cvtgs.checks import checked
 from cvtgs.config import MatchConfig
 from cvtgs.counts import checked_whole
 from cvtgs.errors import InvalidArgumentError
@@ -74,6 +75,7 @@ def linear_view(
     return LinearView(weights, basis, wanted.to(painted) - painted)
 
 
+@checked
 def fit_colors(
     small: GaussianScene, views: ObservedViews, *, config: MatchConfig, frozen: int = 0
 ) -> GaussianScene:
@@ -222,6 +224,7 @@ class Matched(NamedTuple):
     report: MatchReport
 
 
+@checked
 def cell_contributions(
     contributions: Float[Tensor, "n"], partition: Partition
 ) -> Float[Tensor, "m"]:

@@ -1,5 +1,6 @@
 """SimplifyReport and other reports: actions, dropped data and costs of a run."""
 
+from functools import partial
 from pkgutil import resolve_name
 from typing import NamedTuple
 
@@ -124,6 +125,7 @@ class SimplifyReport(CellStatistics):
         matching: Report of the matching to images; None if there was none.
         refinement: Report of the refinement; None if there was none.
         config: The configuration.
+        version: Version of cvtgs that made the result.
     """
 
     input_count: int
@@ -147,6 +149,7 @@ class SimplifyReport(CellStatistics):
     matching: MatchReport | None = None
     refinement: RefineReport | None = None
     config: SimplifyConfig
+    version: str = pydantic.Field(default_factory=partial(resolve_name, "cvtgs:__version__"))
 
     __hash__ = None  # type: ignore[assignment]  # compared by value, and has a dictionary
 

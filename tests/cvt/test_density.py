@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from cvtgs.analysis import perspective_falloff
-from cvtgs.cvt import embed, tessellation_weights
+from cvtgs.cvt import embed, gaussian_weights, tessellation_weights
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.spherical_harmonics import SH_C0
@@ -140,3 +140,11 @@ def test_shapes_that_do_not_fit_are_errors():
         with pytest.raises(InvalidArgumentError) as caught:
             call()
         assert str(caught.value) == text
+
+
+@pytest.mark.parametrize("wrong", [-0.1, math.nan, math.inf, None, "0.1"])
+def test_numbers_of_embeddings_and_weights_are_checked(wrong):
+    with pytest.raises(InvalidArgumentError, match="color must be a finite number of at least 0"):
+        embed(torch.zeros(2, 3), torch.zeros(2, 1, 3), frame=FRAME, color=wrong)
+    with pytest.raises(InvalidArgumentError, match="area_power must be a finite number of at"):
+        gaussian_weights(torch.ones(2), torch.ones(2), area_power=wrong)

@@ -1,10 +1,13 @@
 """Lloyd's algorithm: centroids, energies and when it stops."""
 
+import math
+
 import pytest
 import torch
 
 from cvtgs.cvt import fill_empty_cells, lloyd, nearest_scipy, stratified_seeds, weighted_seeds
 from cvtgs.cvt.tessellate import centroids, weighted_sums
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.frames import morton_order
 
 BACKENDS = {"scipy": nearest_scipy}
@@ -154,3 +157,10 @@ def test_weights_of_zero():
         torch.zeros(6, dtype=torch.int64), torch.zeros(6), torch.ones(6), 4
     )
     assert torch.unique(new).tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("wrong", [-0.1, math.nan, "zz"])
+def test_the_tolerance_is_checked(wrong):
+    points = torch.zeros(2, 1)
+    with pytest.raises(InvalidArgumentError, match="tolerance must be a finite number of at"):
+        lloyd(points, torch.ones(2), points, nearest=nearest_scipy, iterations=1, tolerance=wrong)

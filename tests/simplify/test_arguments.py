@@ -179,9 +179,12 @@ def test_targets_of_a_tessellation_are_whole_numbers(target):
 
 
 def test_analyses_are_of_scenes():
-    for wrong in ("scene.ply", random_scene(3)[:0]):
-        with pytest.raises(InvalidArgumentError, match="must be a GaussianScene of at least one"):
-            analyze(wrong, SimplifyConfig())
+    with pytest.raises(InvalidArgumentError, match="must be a GaussianScene of at least one"):
+        analyze(random_scene(3)[:0], SimplifyConfig())
+    with pytest.raises(InvalidArgumentError, match="must be of type GaussianScene, found str"):
+        analyze("scene.ply", SimplifyConfig())
+    with pytest.raises(InvalidArgumentError, match="config must be of type SimplifyConfig"):
+        analyze(random_scene(3), None)
 
 
 def test_arguments_of_another_kind_are_one_sentence(tmp_path):

@@ -17,6 +17,7 @@ from cvtgs.analysis.effects import (
     plan_haze,
 )
 from cvtgs.cameras import Cameras
+from cvtgs.checks import checked
 from cvtgs.config import SimplifyConfig, TessellationConfig
 from cvtgs.devices import row_chunks
 from cvtgs.errors import InvalidArgumentError, warn
@@ -90,6 +91,7 @@ class SceneAnalysis:
         )
 
 
+@checked
 def analyze(
     scene: GaussianScene, config: SimplifyConfig, *, with_visibility: bool = False
 ) -> SceneAnalysis:
@@ -112,7 +114,7 @@ def analyze(
         >>> analysis.plan.unbounded.active, len(analysis.areas)
         (False, 100)
     """
-    if not isinstance(scene, GaussianScene) or scene.means.numel() == 0:
+    if scene.means.numel() == 0:
         raise InvalidArgumentError(
             f"scene must be a GaussianScene of at least one Gaussian, found {shown(scene)}."
         )

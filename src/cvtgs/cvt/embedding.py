@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.checks import checked
-from cvtgs.counts import check_share
+from cvtgs.counts import check_not_negative, check_share
 from cvtgs.devices import row_chunks
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import LARGEST_COLOR, SH_C0
@@ -38,7 +38,8 @@ def embed(
         Coordinates in robust radii, in the dtype of ``means``; d = 3, or 6 with colour.
 
     Raises:
-        InvalidArgumentError: ``contraction`` is not from 0 to 1, or shapes or types do not fit.
+        InvalidArgumentError: ``contraction`` is not from 0 to 1, ``color`` is negative or not
+            finite, or shapes or types do not fit.
 
     Example:
         >>> import torch
@@ -47,6 +48,7 @@ def embed(
         [[0.5, 0.5, 0.5]]
     """
     check_share(contraction, "contraction")
+    check_not_negative(color, "color")
     colored = sh0 is not None and color > 0.0
     points = means.new_empty(len(means), 6 if colored else 3)
     for part in row_chunks(len(means), CHUNK, means.device):
@@ -80,6 +82,7 @@ def gaussian_weights(
         >>> gaussian_weights(torch.tensor([0.5]), torch.tensor([4.0]), area_power=0.5).tolist()
         [1.0]
     """
+    check_not_negative(area_power, "area_power")
     weights = opacities.double()
     return weights * areas**area_power if area_power else weights
 

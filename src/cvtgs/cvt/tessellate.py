@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cvtgs.checks import check_range, checked
 from cvtgs.config import TessellationConfig
-from cvtgs.counts import checked_whole
+from cvtgs.counts import check_not_negative, checked_whole
 from cvtgs.cvt.nearest import NearestSite, nearest_site, search_device, search_once_per_position
 from cvtgs.devices import move_together
 from cvtgs.errors import InvalidArgumentError
@@ -282,8 +282,8 @@ def lloyd(
         The moved sites and the energies.
 
     Raises:
-        InvalidArgumentError: Shapes do not fit together, ``iterations`` is negative, or the energy
-            is negative or not finite.
+        InvalidArgumentError: Shapes do not fit together, ``iterations`` or ``tolerance`` is
+            negative, or the energy is negative or not finite.
 
     Example:
         >>> from cvtgs.cvt import nearest_scipy
@@ -295,6 +295,7 @@ def lloyd(
         [[0.5], [8.0]]
     """
     iterations = checked_whole(iterations, "iterations", least=0)
+    check_not_negative(tolerance, "tolerance")
     energies: list[float] = []
     points, weights, sites = points.detach(), weights.detach(), sites.detach().double()
     for done in range(iterations):

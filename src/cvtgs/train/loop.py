@@ -63,7 +63,7 @@ def train(
     files: TrainFiles,
     *,
     resume: bool = False,
-    device: torch.device | str = "cpu",
+    device: torch.device | str = "auto",
     listener: ProgressListener = silent,
     on_validation: Callable[[History], None] = lambda history: None,
 ) -> History:
