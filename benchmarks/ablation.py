@@ -15,6 +15,7 @@ COMMAND``.
 """
 
 import argparse
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -27,12 +28,11 @@ from torch import Tensor
 import cvtgs
 from benchmarks.measuring import write_file
 from benchmarks.quality import (
-    SIZE,
-    VIEWS,
     Quality,
     Simplify,
     Table,
     configuration,
+    judge_of,
     markdown,
     means,
     measure,
@@ -40,6 +40,7 @@ from benchmarks.quality import (
 )
 from cvtgs import cells
 from cvtgs.analysis.effects import CLAMPED, mean_clamped
+from cvtgs.errors import MissingDependencyError
 from cvtgs.mergenet import MergeNet, PublishedMergeNet, correct_cells, load_checkpoint
 from cvtgs.pipeline import merge_and_inflate
 from cvtgs.plots import Panel, Series, line_chart
@@ -63,7 +64,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         text = report(table, options)
         if options.output is not None:
             write_file(options.output / "ablation.md", text.encode())
-            write_file(options.output / "ablation.png", chart(means(table), options.rho))
+            try:
+                write_file(options.output / "ablation.png", chart(means(table), options.rho))
+            except MissingDependencyError as error:
+                print(f"without a plot: {error}", file=sys.stderr)
     print(text)
 
 
@@ -92,8 +96,6 @@ def row(preset: str, part: str) -> str:
 
 def report(table: Table, options: argparse.Namespace) -> str:
     """Return the report: the settings of the measurement, then the results."""
-    images = f"cvtgs' own renderer, {VIEWS} automatic views of {SIZE} x {SIZE} pixels"
-    images += f", over {options.background}"
     scenes = "FILES" if options.files else f"--count {options.count}"
     nets = ", ".join(
         [f"{name} {described(name)}" for name in PRESETS]
@@ -104,7 +106,7 @@ def report(table: Table, options: argparse.Namespace) -> str:
         f"`python -m benchmarks.ablation {scenes} -o FOLDER` makes this table (with "
         "`--lpips WEIGHTS` for LPIPS).\n\n"
         f"Scenes: {', '.join(table)}. "
-        f"Judge: {'the command of --scorer' if options.scorer else images}. "
+        f"Judge: {judge_of(options)}. "
         f"cvtgs {cvtgs.__version__}, checkpoints: {nets}.\n\n"
         f"{markdown(table, options.rho, means_only=options.means)}"
     )

@@ -34,6 +34,7 @@ def main() -> None:
     parser.add_argument("output", type=Path)
     parser.add_argument("--count", type=int, default=COUNT)
     options = parser.parse_args()
+    options.output.parent.mkdir(parents=True, exist_ok=True)
     size = (
         len(RATIOS) * (WIDTH + GAP) - GAP,
         len(SHOTS) * (HEIGHT + GAP) - GAP,

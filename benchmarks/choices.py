@@ -28,7 +28,7 @@ from statistics import fmean
 
 import cvtgs
 from benchmarks.cameras import CACHE, FullImages, cameras_beside, spread_cameras
-from benchmarks.measuring import warm_up, write_file
+from benchmarks.measuring import names_of, warm_up, write_file
 from benchmarks.quality import mean_or_none
 from cvtgs.cameras import Cameras
 from cvtgs.evaluation import EvaluationSettings, compare, write_comparison
@@ -86,11 +86,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if name in configurations:
             raise SystemExit(f"--set: {name!r} is given twice.")
         configurations[name] = {**configurations[BASE], **settings_of(words)}
+    names = names_of(options.files)
+    try:
+        simplifiers = {name: simplifier_of(values) for name, values in configurations.items()}
+        for rho in options.rho:
+            cvtgs.target_count(1, rho)
+        for file in options.files:
+            cvtgs.io.scene_file(file).stat()
+    except (cvtgs.CvtgsError, OSError) as error:
+        raise SystemExit(str(error)) from None
     rows: list[Row] = []
     warm_up()
     print(heads(options), flush=True)
-    for file in options.files:
-        for row in measure(file, configurations, options):
+    for name, file in zip(names, options.files, strict=True):
+        for row in measure(name, file, simplifiers, options):
             rows.append(row)
             print(line(row, rows), flush=True)
         save(rows, options.json)
@@ -138,8 +147,19 @@ def settings_of(words: Sequence[str]) -> dict[str, str]:
     return dict(word.split("=", 1) for word in words)
 
 
+def simplifier_of(settings: Settings) -> cvtgs.Simplifier:
+    """Return the simplifier of a configuration."""
+    values = dict(settings)
+    preset, checkpoint = values.pop("preset"), values.pop("ckpt", "auto")
+    config = cvtgs.SimplifyConfig.compose(preset=preset, settings=values)
+    return cvtgs.Simplifier(checkpoint, config=config)
+
+
 def measure(
-    file: Path, configurations: Mapping[str, Settings], options: argparse.Namespace
+    scene_name: str,
+    file: Path,
+    simplifiers: Mapping[str, cvtgs.Simplifier],
+    options: argparse.Namespace,
 ) -> Iterator[Row]:
     """Score all configurations on one scene, ratio by ratio."""
     scene = cvtgs.load(file)
@@ -149,11 +169,7 @@ def measure(
     given = spread_cameras(scene, options.fit) if options.fit else None
     for rho in options.rho:
         kept: dict[str, cvtgs.GaussianScene] = {}
-        for name, settings in configurations.items():
-            values = dict(settings)
-            preset, checkpoint = values.pop("preset"), values.pop("ckpt", "auto")
-            config = cvtgs.SimplifyConfig.compose(preset=preset, settings=values)
-            simplifier = cvtgs.Simplifier(checkpoint, config=config)
+        for name, simplifier in simplifiers.items():
             start = time.process_time()
             small = simplifier.simplify(scene, rho, cameras=given)
             seconds = time.process_time() - start
@@ -161,7 +177,7 @@ def measure(
             assert scores.alpha_error is not None
             assert scores.alpha_bias is not None
             yield Row(
-                scene=file.stem,
+                scene=scene_name,
                 rho=rho,
                 name=name,
                 psnr=scores.psnr.mean,
@@ -176,9 +192,9 @@ def measure(
         if options.pages:
             settings_off = EvaluationSettings(lpips="off")
             comparison = compare(
-                scene, kept, cameras, reference_name=file.stem, settings=settings_off
+                scene, kept, cameras, reference_name=scene_name, settings=settings_off
             )
-            folder = options.pages / f"{file.stem}-{rho:g}"
+            folder = options.pages / f"{scene_name}-{rho:g}"
             write_comparison(comparison, folder, overwrite=True)
 
 

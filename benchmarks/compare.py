@@ -17,11 +17,14 @@ Scenes and scorers are chosen as in ``benchmarks.quality``; ``--cameras CAPTURE 
 --images DIR`` scores against photographs. Run it once on a small scene first, so that compiled
 code is compiled and cached. ``--results FILE`` adds the results to those in the file and shows
 all of them, so that methods can be run one by one; ``--methods`` without names only shows them.
-``--outputs DIR`` keeps every file that a method wrote, with its seconds, and reuses kept files
-instead of running the method again.
+Results in the file must be of the same cameras, size and background. ``--outputs DIR`` keeps every
+file that a method wrote, with its seconds, and reuses a kept file of the same command, scene and
+count instead of running the method again. ``--set`` changes the presets, which then have the
+settings in their names.
 """
 
 import argparse
+import hashlib
 import json
 import re
 import shlex
@@ -33,20 +36,20 @@ from pathlib import Path
 
 import cvtgs
 from benchmarks.baselines import BASELINES
-from benchmarks.cameras import cameras_file
 from benchmarks.compare_tables import (
     Result,
     Table,
     chart,
     failures,
     joined,
+    judges_of,
     markdown,
     read_results,
     results_json,
     wrong_counts,
 )
 from benchmarks.measuring import Cost, machine, run, write_file
-from benchmarks.quality import SIZE, VIEWS, Scorer, make_scorer, scenes, scoring_parser
+from benchmarks.quality import Scorer, judge_of, make_scorer, scenes, scoring_parser
 from cvtgs.errors import MissingDependencyError
 
 NO_NETWORK = "standard, no network"
@@ -74,6 +77,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     commands = commands_of(options)
     text = ""
     known = {} if options.results is None else read_results(options.results)
+    for judge in judges_of(known) if commands else []:
+        if judge != judge_of(options):
+            raise SystemExit(
+                f"--results: {options.results} has results of another judge ({judge}); "
+                f"this is {judge_of(options)}. Name another file."
+            )
     for measured in measure(commands, options) if commands else [{}]:
         table = joined(known, measured)
         if options.results is not None:
@@ -130,9 +139,10 @@ def baseline_methods() -> dict[str, list[str]]:
 
 def commands_of(options: argparse.Namespace) -> dict[str, list[str]]:
     """Return the command of every method, with placeholders, by name."""
-    methods = own_methods(options.set) | baseline_methods()
+    own, suffix = own_methods(options.set), f" ({' '.join(options.set)})" if options.set else ""
+    methods = own | baseline_methods()
     names = list(methods) if options.methods is None else options.methods
-    commands = {name: methods[name] for name in names}
+    commands = {f"{name}{suffix}" if name in own else name: methods[name] for name in names}
     for tool in options.tool:
         name, separator, command = tool.partition("=")
         if not separator or "{OUT}" not in command or "{IN}" not in command:
@@ -158,12 +168,13 @@ def measure(commands: Mapping[str, list[str]], options: argparse.Namespace) -> I
                 for rho in options.rho:
                     place = folder / "small.ply"
                     if options.outputs is not None:
-                        place = options.outputs / f"{scene_name} {rho:g} {method}.ply"
+                        kept = re.sub(r"[/\\]", "-", f"{scene_name} {rho:.12g} {method}")
+                        place = options.outputs / f"{kept}.ply"
                     count = cvtgs.target_count(len(scene), rho)
                     task = Task(source=source, rho=rho, count=count, output=place)
                     runs[method, task] = attempt(command, task, keep=options.outputs is not None)
             score = make_scorer(options, options.files[len(table)] if options.files else None)
-            table[scene_name] = judged(scene, runs, score=score)
+            table[scene_name] = judged(scene, runs, score=score, judge=judge_of(options))
             print(f"compared on {scene_name}: {len(scene)} Gaussians", file=sys.stderr)
             yield dict(table)
 
@@ -185,8 +196,11 @@ Run = tuple[cvtgs.GaussianScene, Cost]
 def attempt(command: Sequence[str], task: Task, *, keep: bool) -> Run | None:
     """Run a method's command on a task, or load its kept file; return None on failure."""
     output, costs = task.output, task.output.with_suffix(".json")
+    made_by = {"command": list(command), "count": task.count, "scene": digest_of(task.source)}
     if keep and output.is_file() and costs.is_file():
-        return cvtgs.load(output), Cost(**json.loads(costs.read_text(encoding="utf-8")))
+        kept = json.loads(costs.read_text(encoding="utf-8"))
+        if kept["made_by"] == made_by:
+            return cvtgs.load(output), Cost(**kept["cost"])
     output.unlink(missing_ok=True)
     output.parent.mkdir(parents=True, exist_ok=True)
     places = {
@@ -202,8 +216,14 @@ def attempt(command: Sequence[str], task: Task, *, keep: bool) -> Run | None:
         print(f"failed: {error}", file=sys.stderr)
         return None
     if keep:
-        write_file(costs, json.dumps(asdict(cost)).encode())
+        write_file(costs, json.dumps({"made_by": made_by, "cost": asdict(cost)}).encode())
     return found, cost
+
+
+def digest_of(source: Path) -> str:
+    """Return the SHA-256 of the file of a scene."""
+    with cvtgs.io.scene_file(source).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def filled(part: str, places: Mapping[str, str]) -> str:
@@ -213,7 +233,11 @@ def filled(part: str, places: Mapping[str, str]) -> str:
 
 
 def judged(
-    scene: cvtgs.GaussianScene, runs: Mapping[tuple[str, Task], Run | None], *, score: Scorer
+    scene: cvtgs.GaussianScene,
+    runs: Mapping[tuple[str, Task], Run | None],
+    *,
+    score: Scorer,
+    judge: str,
 ) -> dict[str, dict[float, Result | None]]:
     """Score all results of one scene in one call of the scorer."""
     small = [made[0] for made in runs.values() if made is not None]
@@ -226,23 +250,14 @@ def judged(
             cpu_seconds=made[1].user_seconds,
             count=len(made[0]),
             wanted=task.count,
+            judge=judge,
         )
     return rows
 
 
 def report(table: Table, options: argparse.Namespace) -> str:
     """Return the report: settings, tables, wrong counts and failures."""
-    judge = "cvtgs' own renderer, " + (
-        "cameras beside the scenes"
-        if options.files and all(cameras_file(file).is_file() for file in options.files)
-        else f"{VIEWS} automatic views of {SIZE} x {SIZE} pixels where none are beside a scene"
-    )
-    if options.cameras is not None:
-        judge = "cvtgs' own renderer, the cameras of --cameras"
-        judge += " against photographs" if options.images is not None else ""
-    judge += f", over {options.background}"
-    if options.scorer:
-        judge = "the command of --scorer"
+    judge = "; ".join(judges_of(table)) or judge_of(options)
     clock = "wall-clock" if options.clock == "wall" else "user CPU"
     parts = [
         f"Scenes: {', '.join(table)}. Judge: {judge}. "

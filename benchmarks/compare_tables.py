@@ -23,6 +23,7 @@ class Result:
         cpu_seconds: User CPU time.
         count: Number of Gaussians in the output.
         wanted: Number of Gaussians that the output should have.
+        judge: How the quality was measured; empty if unknown.
     """
 
     quality: Quality
@@ -30,6 +31,7 @@ class Result:
     cpu_seconds: float
     count: int
     wanted: int
+    judge: str = ""
 
     def seconds(self, clock: Clock) -> float:
         """Return the wall-clock or the CPU time."""
@@ -71,6 +73,12 @@ def read_results(path: Path) -> Table:
         row = table.setdefault(record["scene"], {}).setdefault(record["method"], {})
         row[record["rho"]] = result
     return table
+
+
+def judges_of(table: Table) -> list[str]:
+    """Return how the results were scored, as far as is known."""
+    results = (result for rows in table.values() for row in rows.values() for result in _at(row))
+    return [judge for judge in dict.fromkeys(result.judge for result in results) if judge]
 
 
 def methods_of(table: Table) -> list[str]:

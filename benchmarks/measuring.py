@@ -5,6 +5,7 @@ import platform
 import statistics
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -101,6 +102,23 @@ def generated_scenes(
         cvtgs.save(cvtgs.synthetic.scene(kind, count, sh_degree=degree, seed=seed), path)
         files.append(path)
     return files
+
+
+def names_of(files: Sequence[Path]) -> list[str]:
+    """Return a name for each file: its stem, or folder and name if others have the same stem.
+
+    Raises:
+        SystemExit: Two names would be the same.
+    """
+    stems = Counter(file.stem for file in files)
+    names = [
+        file.stem if stems[file.stem] == 1 else f"{file.resolve().parent.name}-{file.name}"
+        for file in files
+    ]
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise SystemExit(f"{name}: {count} files must not have the same folder and name.")
+    return names
 
 
 def write_file(path: Path, content: bytes) -> None:

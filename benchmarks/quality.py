@@ -17,7 +17,6 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +28,7 @@ from torch import Tensor
 
 import cvtgs
 from benchmarks.cameras import cameras_beside, cameras_file
+from benchmarks.measuring import names_of
 from cvtgs.cameras import Cameras
 from cvtgs.errors import FileFormatError
 from cvtgs.evaluation import (
@@ -154,9 +154,8 @@ def measure(variants: Mapping[str, Simplify], options: argparse.Namespace) -> It
 
 def scenes(files: Sequence[Path], count: int) -> Iterator[tuple[str, cvtgs.GaussianScene]]:
     """Yield names and scenes of the files, or one generated scene of each kind."""
-    stems = Counter(file.stem for file in files)
-    for file in files:
-        yield file.stem if stems[file.stem] == 1 else str(file), cvtgs.load(file)
+    for name, file in zip(names_of(files), files, strict=True):
+        yield name, cvtgs.load(file)
     for seed, kind in enumerate(() if files else cvtgs.synthetic.KINDS):
         yield kind, cvtgs.synthetic.scene(kind, count, sh_degree=1, seed=seed)
 
@@ -176,6 +175,26 @@ def make_scorer(options: argparse.Namespace, file: Path | None) -> Scorer:
     beside = file is not None and cameras_file(file).is_file()
     cameras = cameras_beside(file, size=options.size) if file and beside else None
     return own_scorer(weights, cameras, background=background, size=options.size or SIZE)
+
+
+def judge_of(options: argparse.Namespace) -> str:
+    """Describe the scorer that the options ask for: renderer, cameras, size and background."""
+    if options.scorer:
+        return "the command of --scorer"
+    size = f"{options.size or SIZE} pixels"
+    automatic = f"{VIEWS} automatic views of {size}"
+    if options.cameras is not None:
+        part = f" ({options.split})" if options.split else ""
+        cameras = f"the cameras of --cameras{part}"
+        cameras += " against photographs" if options.images is not None else ""
+    elif not any(cameras_file(file).is_file() for file in options.files):
+        cameras = automatic
+    else:
+        cameras = "cameras beside the scenes"
+        cameras += f" at {size}" if options.size is not None else ""
+        if not all(cameras_file(file).is_file() for file in options.files):
+            cameras += f", {automatic} where there are none"
+    return f"cvtgs' own renderer, {cameras}, over {options.background}"
 
 
 def given_scorer(

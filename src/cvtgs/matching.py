@@ -245,7 +245,7 @@ def cell_contributions(
         >>> cell_contributions(torch.tensor([1.0, 2.0, 4.0]), cells).tolist()
         [2.0, 5.0]
     """
-    if contributions.ndim != 1 or len(contributions) < len(partition.order):
+    if len(contributions) < len(partition.order):
         raise InvalidArgumentError(
             f"contributions must be one number for each Gaussian, at least the "
             f"{len(partition.order):,} in cells; found shape {tuple(contributions.shape)}."

@@ -142,6 +142,16 @@ def test_a_scene_without_cameras_is_refused_by_name(tmp_path):
         camera_files.cameras_beside(tmp_path / "other.ply")
 
 
+@pytest.mark.parametrize("words", [["--rho", "2"], ["--set", "nonsense=1"]])
+def test_mistakes_are_found_before_anything_is_measured(tmp_path, capsys, words):
+    cvtgs.save(SCENE, tmp_path / "thing.ply")
+    with pytest.raises(SystemExit, match=r"nonsense|\b2\b"):
+        choices.main([str(tmp_path / "thing.ply"), "--automatic", *words])
+    with pytest.raises(SystemExit, match=r"none\.ply"):
+        choices.main([str(tmp_path / "none.ply"), "--automatic"])
+    assert capsys.readouterr().out == ""
+
+
 def test_means_are_over_scenes():
     common = {"rho": 0.1, "name": "base", "ssim": 0.5, "lpips": None, "alpha_error": 0.1}
     common |= {"alpha_bias": -0.1, "seconds": 1.0}

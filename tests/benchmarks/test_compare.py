@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ import cvtgs
 import lpips_cases
 from benchmarks import compare, compare_tables, quality
 from benchmarks.baselines import BASELINES, baseline
+from benchmarks.measuring import names_of
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.evaluation.images import as_bytes, encode
 from cvtgs.views import automatic_views
@@ -98,7 +100,7 @@ def test_the_table_has_the_scores_of_the_baseline(file, capsys, background):
         f"{found.ssim.mean:.4f}",
         f"{found.alpha_error.mean:.4f}",
     ]
-    assert f"pixels where none are beside a scene, over {background}. " in text
+    assert f"renderer, 2 automatic views of 48 pixels, over {background}. " in text
 
 
 @pytest.mark.long
@@ -136,8 +138,9 @@ def test_another_judge_and_lpips(file, tmp_path, capsys):
 def test_settings_reach_cvtgs_and_all_methods_run_by_default():
     options = compare.parser().parse_args(["--set", "cvt.iterations=1"])
     commands = compare.commands_of(options)
-    assert list(commands) == [*cvtgs.PRESETS, "standard, no network", *BASELINES]
-    assert all("cvt.iterations=1" in commands[name] for name in cvtgs.PRESETS)
+    own = [f"{name} (cvt.iterations=1)" for name in [*cvtgs.PRESETS, "standard, no network"]]
+    assert list(commands) == [*own, *BASELINES]
+    assert all("cvt.iterations=1" in commands[name] for name in own)
     assert commands["NanoGS"][1:4] == ["-m", "benchmarks.baselines", "NanoGS"]
 
 
@@ -223,6 +226,50 @@ def test_kept_files_are_not_made_again_and_results_accumulate(file, tmp_path, ca
     rows = rows_of(capsys.readouterr().out)
     assert rows[2] == first
     assert rows[3][0] == "opacity pruning"
+
+
+def test_kept_files_of_another_scene_or_command_are_not_used(file, tmp_path):
+    """Scenes of one name, and settings, gave each other's results."""
+    output = tmp_path / "kept.ply"
+    first = "import shutil, sys; shutil.copy(sys.argv[1], sys.argv[2])"
+    command = [sys.executable, "-c", first, "{IN}", "{OUT}"]
+    task = compare.Task(source=file, rho=0.1, count=100, output=output)
+    made, cost = compare.attempt(command, task, keep=True)
+    assert compare.attempt(command, task, keep=True)[1] == cost
+    fails = [sys.executable, "-c", "raise SystemExit(1)", "{IN}", "{OUT}"]
+    assert compare.attempt(fails, task, keep=True) is None
+    cvtgs.save(made[:500], file, overwrite=True)
+    assert len(compare.attempt(command, task, keep=True)[0]) == 500
+
+
+def test_results_of_another_judge_are_not_mixed(file, tmp_path):
+    scored = {"thing": {"x": {0.1: replace(result(20.0), judge="another")}}}
+    (tmp_path / "results.json").write_text(compare_tables.results_json(scored))
+    arguments = [str(file), "--results", str(tmp_path / "results.json"), "--methods", "draft"]
+    with pytest.raises(SystemExit, match="results of another judge \\(another\\); this is cvtgs'"):
+        compare.main(arguments)
+    assert compare_tables.judges_of(scored) == ["another"]
+
+
+def test_the_judge_is_described(file):
+    def described(*arguments: str) -> str:
+        return quality.judge_of(quality.scoring_parser("").parse_args([str(file), *arguments]))
+
+    assert described("--size", "64").endswith("2 automatic views of 64 pixels, over black")
+    assert described("--cameras", "a", "--split", "test").endswith(
+        "of --cameras (test), over black"
+    )
+    file.with_suffix(".cameras.json").touch()
+    assert described("--size", "64").endswith("cameras beside the scenes at 64 pixels, over black")
+
+
+def test_scenes_of_one_name_are_told_apart(tmp_path):
+    files = [tmp_path / part for part in ("a/x.ply", "b/x.ply", "b/x.spz", "b/y.ply")]
+    assert names_of(files) == ["a-x.ply", "b-x.ply", "b-x.spz", "y"]
+    with pytest.raises(
+        SystemExit, match=r"b-x\.ply: 2 files must not have the same folder and name"
+    ):
+        names_of([files[1], files[1]])
 
 
 def test_the_plot_omits_what_failed_on_a_scene(monkeypatch):

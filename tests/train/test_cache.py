@@ -71,7 +71,7 @@ def test_a_scene_is_made_once(source, made, tmp_path):
 def mapped_file(tensor: torch.Tensor) -> str:
     """The file whose pages hold a tensor."""
     for line in Path("/proc/self/maps").read_text(encoding="utf-8").splitlines():
-        words = line.split()
+        words = line.split(maxsplit=5)  # a path may have spaces
         start, end = (int(text, 16) for text in words[0].split("-"))
         if start <= tensor.data_ptr() < end:
             return words[5] if len(words) > 5 else ""
