@@ -18,7 +18,10 @@ from cvtgs import (
     describe,
     render,
 )
+from cvtgs.analysis import analyze
+from cvtgs.cells import Partition
 from cvtgs.clock import StageClock, StageCost, peak_memory_bytes
+from cvtgs.mergenet import load_checkpoint
 from cvtgs.progress import silent
 from scenes import random_scene
 
@@ -152,3 +155,10 @@ def test_objects_with_tensors_have_a_short_repr():
     assert repr(cameras) == "Cameras(1 of 30 x 20 pixels, cpu)"
     found = render(scene, cameras, backend="torch")
     assert repr(found) == "Rendering(1 image of 30 x 20 pixels, torch, cpu)"
+    analysis = analyze(scene, SimplifyConfig())
+    assert repr(analysis).startswith(f"SceneAnalysis(frame={analysis.frame!r}, farthest=")
+    assert "opacities=float32 (1200,)" in repr(analysis)
+    assert repr(analysis).endswith("plan=EffectPlan, observed=None)")
+    cells = Partition.from_labels(torch.tensor([0, 1, 0]), 2)
+    assert repr(cells) == "Partition(order=int64 (3,), offsets=int64 (3,), singles=1)"
+    assert repr(load_checkpoint("standard")).startswith("Checkpoint(net=MergeNet, info=")

@@ -14,6 +14,7 @@ _UNSAFE = re.compile(
 
 MOST_LETTERS = 60  # maximum length of a value in an error message
 MOST_NAMES = 10  # maximum number of columns or elements of a file that a message lists
+LONGEST_REPR = 400  # letters of a value within the repr of an object
 SETTING_LIKENESS = 0.82  # least likeness of an unknown setting to the one that is suggested
 
 
@@ -97,3 +98,19 @@ def columns(text: str) -> int:
 def counted(number: int, word: str) -> str:
     """Return a number of things in words: ``1 view``, ``2 views``."""
     return f"{number:,} {word}" if number == 1 else f"{number:,} {word}s"
+
+
+def short_repr(self: Any) -> str:
+    """Return the ``repr`` of a dataclass, with the dtype and shape of arrays for their values.
+
+    For use as ``__repr__``. A network or another object with a long text is shown by its type.
+    """
+    parts = (f"{name}={_in_short(getattr(self, name))}" for name in self.__dataclass_fields__)
+    return f"{type(self).__name__}({', '.join(parts)})"
+
+
+def _in_short(value: Any) -> str:
+    if hasattr(value, "dtype") and getattr(value, "shape", False):
+        return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
+    text = repr(value)
+    return text if len(text) <= LONGEST_REPR and "\n" not in text else type(value).__name__

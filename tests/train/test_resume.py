@@ -34,7 +34,7 @@ def cache(tmp_path_factory) -> Path:
 @pytest.fixture
 def _quick_curves(monkeypatch) -> None:
     """Drawing takes longer than training here."""
-    monkeypatch.setattr(History, "curves", lambda history: repr(history.to_json()).encode())
+    monkeypatch.setattr(History, "curves", lambda history: repr(history.to_list()).encode())
 
 
 def config_of(scenes: Path, **changes) -> TrainConfig:

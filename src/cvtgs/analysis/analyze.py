@@ -26,7 +26,7 @@ from cvtgs.math.frames import RobustFrame, group_radius, robust_frame
 from cvtgs.math.parameters import NEAR_PLANE, divide
 from cvtgs.rendering import ObservedViews, contributions, observe
 from cvtgs.scene import GaussianScene
-from cvtgs.text import shown
+from cvtgs.text import short_repr, shown
 from cvtgs.views import mixed_views
 
 MIN_OPACITY = 1e-6  # floor of opacities in divisions
@@ -68,6 +68,8 @@ class SceneAnalysis:
     visibility: Float[Tensor, "n_or_0"]
     plan: EffectPlan
     observed: ObservedViews | None = None
+
+    __repr__ = short_repr
 
     def select(self, rows: Tensor) -> Self:
         """Return the analysis of some Gaussians.

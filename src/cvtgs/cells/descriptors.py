@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cells.partition import Partition
+from cvtgs.text import short_repr
 
 MEMBER_FEATURES = 19  # number of features of a member relative to its cell
 PAIR_FEATURES = 18  # number of features of a neighbour relative to a cell
@@ -49,6 +50,8 @@ class Descriptors:
     offsets: Int[Tensor, "m_plus_1"]
     positions: Float[Tensor, "n 3"]
     pair_positions: Float[Tensor, "m k 3"]
+
+    __repr__ = short_repr
 
     def __len__(self) -> int:
         """Return the number of cells."""

@@ -22,7 +22,7 @@ from cvtgs.math.segments import (
     true_rows,
 )
 from cvtgs.scene import GaussianScene
-from cvtgs.text import shown
+from cvtgs.text import short_repr, shown
 
 MOST_SAMPLED = 32  # largest number of described members of a cell
 
@@ -47,6 +47,8 @@ class Partition:
     order: Int[Tensor, "n"]
     offsets: Int[Tensor, "m_plus_1"]
     singles: int | None = None
+
+    __repr__ = short_repr
 
     @classmethod
     @checked

@@ -15,6 +15,7 @@ from cvtgs.cvt.nearest import NearestSite, nearest_site, search_device, search_o
 from cvtgs.devices import move_together
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.segments import label_argmin, label_sums, running_sums, smallest_rows
+from cvtgs.text import short_repr
 
 MIN_SAMPLES = 1 << 15  # smallest sample of points for Lloyd; fewer would save next to no time
 
@@ -37,6 +38,8 @@ class Tessellation:
     energies: tuple[float, ...]
     energy: float
     refilled: int
+
+    __repr__ = short_repr
 
 
 @checked

@@ -29,7 +29,7 @@ from cvtgs.evaluation.scorer import (
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.rendering import choose_backend
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
-from cvtgs.text import printable_name, shown
+from cvtgs.text import printable_name, short_repr, shown
 
 STAGE = "evaluate"  # stage name in progress events; one step per image
 ROUNDING = 1e-3  # values of photographs may be outside [0, 1] by this much, as in half precision
@@ -67,6 +67,8 @@ class Comparison:
     full: SceneImages
     small: Mapping[str, SceneImages]
     sizes: Mapping[str, int]
+
+    __repr__ = short_repr
 
     @property
     def views(self) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from cvtgs.errors import (
 )
 from cvtgs.io.files import is_folder, open_input
 from cvtgs.losses import check_pair
+from cvtgs.text import short_repr
 
 LPIPS_VARIABLE = "CVTGS_LPIPS_WEIGHTS"
 """Environment variable with the path of a weights file, or of a folder of weights files."""
@@ -100,6 +101,8 @@ class LpipsWeights:
     network: LpipsNetwork
     tensors: Mapping[str, Tensor]
     source: str
+
+    __repr__ = short_repr
 
 
 @torch.no_grad()

@@ -25,7 +25,7 @@ from cvtgs.errors import (
 from cvtgs.io.tensors import pack_tensors, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet
 from cvtgs.mergenet.published import Net, PublishedArchitecture, PublishedMergeNet
-from cvtgs.text import printable, printable_name, shown
+from cvtgs.text import printable, printable_name, short_repr, shown
 
 SHIPPED = ("standard", "paper")
 """Names of the checkpoints that come with the package."""
@@ -108,6 +108,8 @@ class Checkpoint:
     info: CheckpointInfo
     name: str
     digest: str
+
+    __repr__ = short_repr
 
 
 def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:

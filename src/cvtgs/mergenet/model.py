@@ -22,6 +22,7 @@ from cvtgs.cells.descriptors import (
 from cvtgs.config.base import Record
 from cvtgs.devices import move_together
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
+from cvtgs.text import short_repr
 
 Width = Annotated[int, pydantic.Field(ge=1, le=1024)]
 CellWidth = Annotated[int, pydantic.Field(ge=1, le=4096)]
@@ -93,6 +94,8 @@ class Residuals:
     d_logit_opacities: Float[Tensor, "m"]
     member_colors: Float[Tensor, "n"]
     pair_colors: Float[Tensor, "m k"]
+
+    __repr__ = short_repr
 
     def cost(self) -> Float[Tensor, ""]:
         """Return the mean square of all changes but colours, each in units of a large change.

@@ -17,7 +17,7 @@ from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.rendering.backends import BackendName, BlendingWeights, choose_backend, without_gradients
 from cvtgs.scene import GaussianScene, SceneLike, as_scene, check_scene
-from cvtgs.text import counted, shown
+from cvtgs.text import counted, short_repr, shown
 
 LEAST_ERROR = 1e-12  # mean squared error below which images count as equal
 
@@ -192,6 +192,8 @@ class ObservedViews:
     alpha: Float[Tensor, "c h w"]
     contributions: Float[Tensor, "n"]
     backend: str
+
+    __repr__ = short_repr
 
 
 def check_observed(views: object, name: str) -> None:

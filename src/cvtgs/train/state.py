@@ -152,21 +152,21 @@ class History:
         best = self.best()
         return 0 if best is None else len(self.validations) - 1 - self.validations.index(best)
 
-    def to_json(self) -> list[Any]:
+    def to_list(self) -> list[Any]:
         """Return the validations as plain values.
 
         Returns:
-            Lists, numbers and strings, for :meth:`from_json`.
+            Lists, numbers and strings, for :meth:`from_list`.
         """
         values: list[Any] = _VALIDATIONS.dump_python(self.validations, mode="json")
         return values
 
     @classmethod
-    def from_json(cls, values: list[Any]) -> Self:
+    def from_list(cls, values: list[Any]) -> Self:
         """Build a history from plain values.
 
         Args:
-            values: Result of :meth:`to_json`.
+            values: Result of :meth:`to_list`.
 
         Raises:
             ValueError: The values do not describe a history.
@@ -246,7 +246,7 @@ class TrainState:
             tensors |= add_prefix(f"optimizer/{number}/", values)
         record = {
             "step": self.step,
-            "history": self.history.to_json(),
+            "history": self.history.to_list(),
             "config": _fingerprint(config, self.start),
             "version": cvtgs.__version__,
             "scenes": [scene.model_dump() for scene in self.scenes],
@@ -268,7 +268,7 @@ class TrainState:
             # Mapped tensors must not be written to, and the optimiser does not copy them: clone.
             self._load_tensors({name: values.clone() for name, values in tensors.items()})
             self.step = int(record["step"])
-            self.history = History.from_json(record["history"])
+            self.history = History.from_list(record["history"])
         except CheckpointError:
             raise
         except (KeyError, ValueError, TypeError, RuntimeError) as error:

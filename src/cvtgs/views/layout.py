@@ -12,6 +12,7 @@ from cvtgs.errors import InvalidSceneError
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import divide
 from cvtgs.scene import GaussianScene
+from cvtgs.text import short_repr
 from cvtgs.validity import valid_part, with_finite_opacities
 from cvtgs.views.up import VOXEL_SIZE, Voxels, among_others, find_floor, find_up, voxelize
 
@@ -208,6 +209,8 @@ class SceneLayout:
     floor: float | None  # height along ``up``; None without a floor
     room: Float[Tensor, "3"] | None  # eye point in its middle; None if not seen from inside
     cutaway: Float[Tensor, "3"] | None  # middle of a room that is open to a side, else None
+
+    __repr__ = short_repr
 
     @property
     def subject(self) -> Float[Tensor, "3"]:

@@ -17,7 +17,7 @@ from cvtgs.counts import checked_whole, is_truth_value, real_number
 from cvtgs.devices import HOST, in_chunks
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
-from cvtgs.text import shown
+from cvtgs.text import short_repr, shown
 from cvtgs.views.layout import (
     ENCLOSED,
     FREE,
@@ -88,6 +88,8 @@ class CameraPositions:
     cluttered: Float[Tensor, "k 3"]
     eyes: Float[Tensor, "p 3"]
     distances: Float[Tensor, "p"]
+
+    __repr__ = short_repr
 
     @checked
     def admit(self, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, "c"]:
