@@ -152,6 +152,23 @@ def test_mistakes_are_found_before_anything_is_measured(tmp_path, capsys, words)
     assert capsys.readouterr().out == ""
 
 
+def test_scenes_of_one_name_have_bases_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(choices, "warm_up", lambda: None)
+    for folder, scene in (("a", SCENE), ("b", SCENE[:300])):
+        (tmp_path / folder).mkdir()
+        cvtgs.save(scene, tmp_path / folder / "thing.ply")
+    files = [str(tmp_path / folder / "thing.ply") for folder in ("a", "b")]
+    output = tmp_path / "rows.json"
+    given = ["--automatic", "--size", "32", "--rho", "0.1", "--set", "preset=draft"]
+    choices.main([*files, *given, "--cache", str(tmp_path / "cache"), "--json", str(output)])
+    rows = json.loads(output.read_text())
+    assert [row["scene"] for row in rows] == [
+        *["a-thing.ply"] * 2,
+        *["b-thing.ply"] * 2,
+        *["mean"] * 2,
+    ]
+
+
 def test_means_are_over_scenes():
     common = {"rho": 0.1, "name": "base", "ssim": 0.5, "lpips": None, "alpha_error": 0.1}
     common |= {"alpha_bias": -0.1, "seconds": 1.0}
