@@ -168,8 +168,7 @@ def measure(commands: Mapping[str, list[str]], options: argparse.Namespace) -> I
                 for rho in options.rho:
                     place = folder / "small.ply"
                     if options.outputs is not None:
-                        kept = re.sub(r"[/\\]", "-", f"{scene_name} {rho:.12g} {method}")
-                        place = options.outputs / f"{kept}.ply"
+                        place = options.outputs / kept_name(scene_name, rho, method)
                     count = cvtgs.target_count(len(scene), rho)
                     task = Task(source=source, rho=rho, count=count, output=place)
                     runs[method, task] = attempt(command, task, keep=options.outputs is not None)
@@ -177,6 +176,11 @@ def measure(commands: Mapping[str, list[str]], options: argparse.Namespace) -> I
             table[scene_name] = judged(scene, runs, score=score, judge=judge_of(options))
             print(f"compared on {scene_name}: {len(scene)} Gaussians", file=sys.stderr)
             yield dict(table)
+
+
+def kept_name(scene_name: str, rho: float, method: str) -> str:
+    """Return the name of the file that a method wrote for a scene and a ratio."""
+    return re.sub(r"[/\\]", "-", f"{scene_name} {rho:.12g} {method}.ply")
 
 
 def sources(

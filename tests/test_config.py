@@ -317,6 +317,17 @@ def test_a_section_of_a_file_that_is_none_is_named(tmp_path):
         SimplifyConfig.compose(file=path, settings={"cvt.iterations": "4"})
 
 
+def test_errors_of_the_command_line_do_not_blame_the_file(tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_text("[cvt]\ncolor = 0.1\n")
+    assert compose_error(file=path, preset="nope").startswith("preset must be one of ")
+    assert compose_error(file=path, settings={"cvt.iterations": "-1"}).startswith(
+        "cvt.iterations: "
+    )
+    path.write_text("[cvt]\ncolor = -1\n")
+    assert compose_error(file=path, preset="fast").startswith(f"{path}: cvt.color: ")
+
+
 @pytest.mark.parametrize("value", [True, False])
 def test_a_truth_value_is_no_sh_degree(value):
     assert error_of({"effects": {"sh": value}}).startswith("effects.sh: input should be 'auto', ")

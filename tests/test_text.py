@@ -5,13 +5,15 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import cvtgs
 from cvtgs.cli.main import main
-from cvtgs.text import columns, first_of, printable, shortened, shown, size_text
+from cvtgs.text import columns, first_of, printable, short_repr, shortened, shown, size_text
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
 
 CLI = Path(cvtgs.__file__).parent / "cli"
@@ -189,3 +191,25 @@ def test_a_line_feed_in_a_name_starts_no_line(
     path.write_bytes(b"no ply")
     assert main(["info", str(path)]) == 1
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_short_repr_has_shapes_and_hides_long_values():
+    @dataclass(repr=False)
+    class Thing:
+        name: str
+        values: object
+        number: object
+        lines: object
+        long: object
+
+        __repr__ = short_repr
+
+    thing = Thing("a", np.zeros((2, 3)), np.float32(2.0), Lines(), ["a" * 500])
+    assert repr(thing).endswith(
+        "Thing(name='a', values=float64 (2, 3), number=np.float32(2.0), lines=Lines, long=list)"
+    )
+
+
+class Lines:
+    def __repr__(self) -> str:
+        return "a\nb"

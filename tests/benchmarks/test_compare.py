@@ -12,7 +12,7 @@ import cvtgs
 import lpips_cases
 from benchmarks import compare, compare_tables, quality
 from benchmarks.baselines import BASELINES, baseline
-from benchmarks.measuring import names_of
+from benchmarks.measuring import Cost, names_of
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.evaluation.images import as_bytes, encode
 from cvtgs.views import automatic_views
@@ -236,10 +236,37 @@ def test_kept_files_of_another_scene_or_command_are_not_used(file, tmp_path):
     task = compare.Task(source=file, rho=0.1, count=100, output=output)
     made, cost = compare.attempt(command, task, keep=True)
     assert compare.attempt(command, task, keep=True)[1] == cost
-    fails = [sys.executable, "-c", "raise SystemExit(1)", "{IN}", "{OUT}"]
-    assert compare.attempt(fails, task, keep=True) is None
     cvtgs.save(made[:500], file, overwrite=True)
     assert len(compare.attempt(command, task, keep=True)[0]) == 500
+    fails = [sys.executable, "-c", "raise SystemExit(1)", "{IN}", "{OUT}"]
+    assert compare.attempt(fails, task, keep=True) is None
+
+
+def test_names_of_kept_files_have_no_folders_and_all_digits():
+    assert compare.kept_name("a", 0.1234564, "my/tool") == "a 0.1234564 my-tool.ply"
+
+
+def test_results_say_how_they_were_scored(file, tmp_path):
+    scene, task = cvtgs.load(file), compare.Task(source=file, rho=0.1, count=9, output=tmp_path)
+    cost = Cost(wall_seconds=1.0, user_seconds=2.0, peak_bytes=3, output="")
+    rows = compare.judged(
+        scene,
+        {("x", task): (scene, cost)},
+        score=lambda full, small: [result(5.0).quality],
+        judge="j",
+    )
+    assert rows == {
+        "x": {
+            0.1: compare_tables.Result(
+                quality=result(5.0).quality,
+                wall_seconds=1.0,
+                cpu_seconds=2.0,
+                count=1000,
+                wanted=9,
+                judge="j",
+            )
+        }
+    }
 
 
 def test_results_of_another_judge_are_not_mixed(file, tmp_path):

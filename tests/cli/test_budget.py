@@ -97,6 +97,10 @@ def test_some_options_exclude_each_other(capsys):
             "--time-budget chooses the preset and cannot be used with --preset, --refine.",
         ),
         (
+            ["--rho", "0.1", "--time-budget", "2m", "--refine-steps", "3"],
+            "--time-budget chooses the preset and cannot be used with --refine-steps.",
+        ),
+        (
             ["--target-psnr", "30", "--time-budget", "2m"],
             "--time-budget chooses the preset and cannot be used with --target-psnr.",
         ),

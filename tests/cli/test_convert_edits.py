@@ -12,6 +12,7 @@ from cvtgs.boxes import Box, Sphere
 from cvtgs.cli.main import main
 from cvtgs.edit import Motion, crop, drop_faint, drop_large, merge, move
 from cvtgs.io import losses
+from cvtgs.tags import TWO_SCALES
 from format_cases import storable_scene
 from scenes import random_scene, same_bits
 
@@ -184,6 +185,23 @@ def test_the_steps_of_a_spz_far_from_the_origin_are_printed(
     assert load(target).means[:, 0].unique().numel() < len(scene) / 2
     assert main(["convert", str(source), str(tmp_path / "near.spz")]) == 0
     assert "digits of positions" not in capsys.readouterr().out
+
+
+def test_quiet_conversions_warn_of_what_edits_lose(
+    tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, flat = tmp_path / "in.ply", tmp_path / "flat.ply"
+    save(scene, source)
+    save(replace(scene, comments=(TWO_SCALES.text,)), flat)
+    for more, lost in (
+        (["--translate=4500000,0,0"], "out.ply: lost digits of positions (steps of 0."),
+        (["--merge", str(source)], "out.ply: lost the tag '"),
+    ):
+        words = ["convert", str(flat), str(tmp_path / "out.ply"), *more, "--overwrite", "--quiet"]
+        assert main(words) == 0
+        printed, warned = capsys.readouterr()
+        assert printed == ""
+        assert warned.count(lost) == 1
 
 
 def test_double_precision_far_from_the_origin_is_lost_in_steps() -> None:

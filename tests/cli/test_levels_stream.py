@@ -58,12 +58,13 @@ def test_an_environment_is_mentioned_only_if_there_is_one(
         (["--stream", "sog", "--environment", "-1"], "--environment must be above 0"),
         (["--stream", "sog", "--environment", "inf"], "--environment must be above 0"),
         (["--memory", "2GB"], "--memory needs --stream."),
+        (["--transform", "1"], "--transform needs --stream 3dtiles."),
         (["--stream", "sog", "--place", "8,47"], "--place and --transform need --stream 3dtiles."),
         (
             ["--stream", "3dtiles", "--place", "8"],
             "--place must be 2 or 3 numbers separated by commas",
         ),
-        (["--stream", "3dtiles", "--place", "8,97"], "a latitude from -90 to 90"),
+        (["--stream", "3dtiles", "--place", "8,97"], "--place: a place on Earth needs"),
         (["--stream", "3dtiles", "--transform", "1,2"], "--transform must be 16 numbers"),
         (
             ["--stream", "3dtiles", "--axes", "rub:rub"],
@@ -205,7 +206,7 @@ def test_a_page_shows_a_scene_that_is_named_like_a_level(tmp_path, monkeypatch):
     assert {name: len(one) for name, one in shown.items()} == {str(path): 30, "rho_0.5.ply": 15}
 
 
-@pytest.mark.parametrize("axes", [[], ["--axes", "rub"]])
+@pytest.mark.parametrize("axes", [[], ["--axes", "rdf"], ["--axes", "rub"]])
 def test_turned_scenes_are_not_scored_from_cameras_beside_them(
     tmp_path: Path, words: list[str], axes: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -214,7 +215,17 @@ def test_turned_scenes_are_not_scored_from_cameras_beside_them(
     entries = [{**entry, "position": [x, 0, -4], "rotation": turn} for x in (0, 1)]
     (tmp_path / "cameras.json").write_text(json.dumps(entries))
     assert main([*words, "--rho", "0.1", *axes]) == 0
-    assert ("cameras found in" in capsys.readouterr().err) == (not axes)
+    assert ("cameras found in" in capsys.readouterr().err) == ("rub" not in axes)
+
+
+def test_a_stream_is_written_into_new_folders_and_may_lack_gaussians(tmp_path, capsys):
+    scene = random_scene(60)
+    scene.means[3, 0] = float("nan")
+    save(scene, tmp_path / "a.ply")
+    words = ["levels", str(tmp_path / "a.ply"), "--rho", "1,0.5", "--stream", "sog"]
+    assert main([*words, "-o", str(tmp_path / "new" / "out")]) == 0
+    assert (tmp_path / "new" / "out" / "lod-meta.json").is_file()
+    assert "Fewer than the requested 60: only 59 of 60 Gaussians are" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -141,6 +141,11 @@ def test_settings_that_are_not_used_are_mentioned(capsys, source):
     assert "--set refine.size had no effect" in text
 
 
+def test_images_that_nothing_needs_are_mentioned(capsys, source):
+    text = simplified(capsys, source, "--rho", "1", "--preset", "matched", "--overwrite")
+    assert "No images were rendered, since no Gaussians had to merge." in text
+
+
 def test_cameras_that_are_not_used_are_mentioned(capsys, source):
     cameras = write_cameras(source.with_name("views.json"))
     text = simplified(capsys, source, "--rho", "0.1", "--cameras", cameras)

@@ -1,6 +1,7 @@
 """PSNR, SSIM and alpha error against hand-computed values and scipy."""
 
 import math
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from cvtgs.evaluation import (
     psnr,
     ssim,
 )
-from cvtgs.evaluation.scorer import check_seen
+from cvtgs.evaluation.compare import check_seen
 from cvtgs.losses import ssim_loss
 from cvtgs.views import automatic_views
 from scenes import random_scene
@@ -215,6 +216,18 @@ def test_gaussians_that_no_renderer_draws_are_not_seen() -> None:
     with pytest.raises(InvalidArgumentError, match="the cameras must see it, found nothing"):
         check_seen(scene, camera, name="it")
     check_seen(scene.select([0]), camera, name="it")  # if nothing is drawn, all centres count
+
+
+@pytest.mark.parametrize("blind", [0, 1, 2])
+def test_cameras_most_of_which_see_nothing_are_a_warning(blind: int) -> None:
+    intrinsics = torch.tensor([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]]).expand(3, 3, 3)
+    poses = torch.eye(4).repeat(3, 1, 1)
+    poses[:blind, 0, 3] = 1e4
+    cameras = Cameras(viewmats=poses, Ks=intrinsics, width=16, height=16)
+    scene = random_scene(20).with_tensors(means=torch.tensor([[0.0, 0.0, 3.0]]).repeat(20, 1))
+    expected = pytest.warns(UserWarning, match=r"^2 of 3 cameras see nothing of it; give cameras")
+    with expected if blind == 2 else nullcontext():
+        check_seen(scene, cameras, name="it")
 
 
 def test_a_scene_nearer_than_the_near_plane_is_not_seen() -> None:

@@ -43,10 +43,20 @@ def test_grey_of_16_bits_is_that_of_8(suffix, tmp_path):
     one = cvtgs.Cameras(
         viewmats=torch.eye(4)[None], Ks=torch.eye(3)[None], width=16, height=16, names=("a",)
     )
-    Image.fromarray(values.astype(np.uint16) * 257).save(tmp_path / f"a{suffix}")
-    found = load_photographs(tmp_path, one)[0]
-    for channel in range(3):
-        assert (found[:, :, channel] * 255).round().byte().numpy().tolist() == values.tolist()
+    for nearly in (-128, 0, 128):  # rounds to the same eight bits
+        grey = (values.astype(np.int64) * 257 + nearly).clip(0, 65535).astype(np.uint16)
+        Image.fromarray(grey).save(tmp_path / f"a{suffix}")
+        found = load_photographs(tmp_path, one)[0]
+        for channel in range(3):
+            assert (found[:, :, channel] * 255).round().byte().numpy().tolist() == values.tolist()
+
+
+def test_suffixes_may_be_written_in_any_case(tmp_path):
+    one = cvtgs.Cameras(
+        viewmats=torch.eye(4)[None], Ks=torch.eye(3)[None], width=8, height=8, names=("a.jpg",)
+    )
+    (tmp_path / "a.Jpg").write_bytes(encode(np.zeros((8, 8, 3), np.uint8), "png"))
+    assert load_photographs(tmp_path, one).shape == (1, 8, 8, 3)
 
 
 def test_an_image_of_floats_is_refused(tmp_path):

@@ -15,7 +15,8 @@ from cvtgs.clock import check_listener
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import real_number, target_count
 from cvtgs.errors import GoalError, InvalidArgumentError, InvalidSceneError
-from cvtgs.evaluation.scorer import MOST_PSNR, Metrics, Scorer, check_seen, scene_scores
+from cvtgs.evaluation.compare import check_seen
+from cvtgs.evaluation.scorer import MOST_PSNR, Metrics, Scorer, scene_scores
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import Simplified, SimplifyReport
 from cvtgs.scene import GaussianScene, SceneLike

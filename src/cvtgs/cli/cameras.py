@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cvtgs
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from cvtgs.cameras import Cameras
     from cvtgs.evaluation import Evaluation, EvaluationSettings
     from cvtgs.scene import GaussianScene
+    from cvtgs.views import OwnCameras
 
 Color = tuple[float, float, float]
 
@@ -132,8 +134,7 @@ def choose_cameras(
             return cvtgs.evaluation.fit_cameras(cameras, images)
         return cameras if options.size is None else cameras.fitted(size)
     path = options.reference if "reference" in options else options.input
-    is_turned = read_axes(getattr(options, "axes", None)).source is not None
-    own = None if is_turned else cvtgs.views.find_own_cameras(scene, path)
+    own = own_cameras(options, scene, path)
     if own is not None:
         test = own.test_cameras() if held_out else None
         if not options.quiet:
@@ -142,6 +143,17 @@ def choose_cameras(
         return (test or own.cameras).spread(views).fitted(size)
     height = max(1, round(0.75 * size))
     return cvtgs.views.automatic_views(scene, views, width=size, height=height)
+
+
+def own_cameras(
+    options: argparse.Namespace, scene: "GaussianScene", path: Path
+) -> "OwnCameras | None":
+    """Find the cameras beside a scene, unless ``--axes`` turns the scene away from them."""
+    from cvtgs.io.axes import SCENE_AXES
+
+    if read_axes(getattr(options, "axes", None)).source not in (None, SCENE_AXES):
+        return None
+    return cvtgs.views.find_own_cameras(scene, path)
 
 
 def read_photographs(options: argparse.Namespace, cameras: "Cameras") -> "Tensor":

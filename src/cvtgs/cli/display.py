@@ -133,6 +133,8 @@ def report_notes(report: "SimplifyReport") -> list[str]:
         notes.append(f"In {report.blocks} blocks{resumed}.")
     if report.shortfall:
         notes.append(shortfall_note(report))
+    if report.config.uses_images and report.views == "none":
+        notes.append("No images were rendered, since no Gaussians had to merge.")
     if report.matching is not None:
         from cvtgs.matching import heldout_rows
 

@@ -55,8 +55,8 @@ def render(options: argparse.Namespace) -> None:
     import torch
 
     from cvtgs.devices import chosen_device
+    from cvtgs.evaluation.compare import LEAST_COVER
     from cvtgs.evaluation.images import as_bytes, encode
-    from cvtgs.evaluation.scorer import LEAST_COVER
     from cvtgs.io.atomic import make_folder
 
     check_view_options(options)

@@ -30,7 +30,7 @@ from cvtgs.cli.options import (
     read_settings,
 )
 from cvtgs.cli.paths import any_path
-from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, without_warnings
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn, without_warnings
 from cvtgs.tags import TWO_SCALES, described_tags
 from cvtgs.text import counted, first_of, size_text
 
@@ -324,9 +324,9 @@ def convert(options: argparse.Namespace) -> None:
         for job in jobs:
             cvtgs.io.check_save(job.options.output, overwrite=options.overwrite)
             if options.spz_version and not job.options.output.name.lower().endswith(".spz"):
-                raise InvalidArgumentError(
-                    f"--spz-version needs a .spz to write, found {job.options.output.name}."
-                )
+                stream = "standard output without --suffix .spz"
+                found = stream if job.to_stream else job.options.output.name
+                raise InvalidArgumentError(f"--spz-version needs a .spz to write, found {found}.")
         run_jobs(jobs, lambda job: _convert_one(job, edits))
 
 
@@ -378,6 +378,9 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
             say_wrapped(phrase, indent=2, file=stream)
         rest = "nothing else" if lost.changed else "nothing"
         say_wrapped(f"Lost: {'; '.join([*phrases, *lost.dropped]) or rest}.", file=stream)
+    unasked = [phrase for phrase in phrases if phrase.startswith((LOST_DIGITS, "the tag"))]
+    if options.quiet and unasked:  # columns and what the format cannot hold have warnings already
+        warn(f"{options.output}: lost {'; '.join(unasked)}.", DroppedDataWarning)
     with nullcontext() if options.quiet else without_warnings(DroppedDataWarning):
         cvtgs.io.save(
             scene,

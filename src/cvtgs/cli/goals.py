@@ -64,7 +64,8 @@ def check_goals(options: argparse.Namespace) -> None:
         "--preset": options.preset is not None,
         "--config": options.config is not None,
         "--ckpt": options.ckpt not in ("auto", "none"),
-        "--refine": options.refine is not None or options.refine_steps is not None,
+        "--refine": options.refine is not None,
+        "--refine-steps": options.refine_steps is not None,
         "--target-psnr": options.target_psnr is not None,
         "--target-ssim": options.target_ssim is not None,
     }

@@ -11,6 +11,7 @@ from cvtgs.cli.cameras import (
     check_view_options,
     choose_cameras,
     evaluation_settings,
+    own_cameras,
     say_views,
 )
 from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped, shortfall_note
@@ -168,9 +169,7 @@ def _cameras_to_fit(options: argparse.Namespace, scene: "GaussianScene") -> "Cam
     """Read the cameras for presets that use images: not the split, by which levels are scored."""
     if options.cameras is not None:
         return cvtgs.load_cameras(options.cameras, split=options.split and "train")
-    if read_axes(options.axes).source is not None:
-        return None
-    own = cvtgs.views.find_own_cameras(scene, options.input)
+    own = own_cameras(options, scene, options.input)
     return None if own is None else own.cameras
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.blocks import add_block_options, block_workers, check_block_device, memory_of
-from cvtgs.cli.cameras import check_split, read_cameras
+from cvtgs.cli.cameras import check_split, own_cameras, read_cameras
 from cvtgs.cli.display import TIE, progress_bars, report_notes, target_note
 from cvtgs.cli.goals import (
     STARTED,
@@ -257,8 +257,8 @@ def _simplify_in_memory(
         config = cvtgs.SimplifyConfig.compose(preset=chosen.name, settings=settings)
         notes.append(chosen.reason)
     if cameras is None and config.uses_images:
-        own = cvtgs.views.find_own_cameras(scene, options.input)
-        if own is not None and axes.source is None:
+        own = own_cameras(options, scene, options.input)
+        if own is not None:
             cameras = own.cameras
             notes.append(
                 f"Rendered from {counted(len(cameras), 'camera')} found in {own.source.resolve()}."

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.blocks import add_block_options, block_workers, check_block_device, memory_of
-from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped
+from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped, shortfall_note
 from cvtgs.cli.options import read_axes, read_numbers
 from cvtgs.errors import ConfigError, FileFormatError, InputError, InvalidArgumentError
 from cvtgs.text import size_text
@@ -38,7 +38,8 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
         "--chunk",
         type=int,
         metavar="N",
-        help="most Gaussians per chunk of a stream, at its finest level (default 32768)",
+        help="most Gaussians per chunk of a stream, at its finest level, where the coarsest "
+        "level has more than one to divide (default 32768)",
     )
     parser.add_argument(
         "--environment",
@@ -65,6 +66,7 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
 
 def check_stream_options(options: argparse.Namespace) -> None:
     """Check the options of streams before the long work starts."""
+    from cvtgs.io.atomic import make_folder
     from cvtgs.streams.files import check_stream
 
     scoring = [name for name, default in OF_SCORES.items() if getattr(options, name) != default]
@@ -73,7 +75,8 @@ def check_stream_options(options: argparse.Namespace) -> None:
     if options.stream is None:
         for name in OF_STREAMS:
             if getattr(options, name) is not None:
-                raise InvalidArgumentError(f"--{name} needs --stream.")
+                kind = " 3dtiles" if name in ("place", "transform") else ""
+                raise InvalidArgumentError(f"--{name} needs --stream{kind}.")
         return
     excluded = [name for name in ("viewer", "suffix") if getattr(options, name)] + scoring
     if excluded:
@@ -94,6 +97,7 @@ def check_stream_options(options: argparse.Namespace) -> None:
             f"--environment must be above 0, and needs --stream sog; found {far:g}."
         )
     read_transform(options)
+    make_folder(options.output.parent)
     check_stream(options.output, options.stream, overwrite=options.overwrite)
 
 
@@ -115,7 +119,10 @@ def read_transform(options: argparse.Namespace) -> tuple[float, ...] | None:
     longitude, latitude, *height = read_numbers(
         options.place, (2, 3), name="--place", meaning=meaning
     )
-    return geo_transform(longitude, latitude, *height)
+    try:
+        return geo_transform(longitude, latitude, *height)
+    except InvalidArgumentError as error:
+        raise InvalidArgumentError(f"--place: {error}") from None
 
 
 def stream_blocks(
@@ -214,6 +221,8 @@ def stream_levels(
         )
     remove_job_files(options.output, is_stream=True)
     errors = [level.geometric_error for level in plan.levels]
+    if made[0].report.shortfall and not options.quiet:
+        say(shortfall_note(made[0].report))
     _print_levels(options, len(plan.chunks), written, errors=errors)
 
 

@@ -278,8 +278,18 @@ class SimplifyConfig(Section):
                         raise ConfigError(f"{named(key)}: is not a known setting.")
                 target[name] = text
             return cls.from_mapping(values)
+        except ConfigError:
+            if file is not None:
+                cls._check_file(Path(file))
+            raise
+
+    @classmethod
+    def _check_file(cls, file: Path) -> None:
+        """Raise an error that names a file if the file alone is no configuration."""
+        try:
+            cls.from_mapping(read_toml(file))
         except ConfigError as error:
-            raise ConfigError(str(error) if file is None else f"{file}: {error}") from None
+            raise ConfigError(f"{file}: {error}") from None
 
     def to_toml(self) -> str:
         """Return the configuration as TOML text; :meth:`from_toml` reads it from a file.

@@ -13,7 +13,7 @@ from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.checks import check_kinds
 from cvtgs.clock import check_listener
 from cvtgs.counts import checked_whole, spread_rows
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import InvalidArgumentError, warn
 from cvtgs.evaluation.images import as_bytes
 from cvtgs.evaluation.scorer import (
     Evaluation,
@@ -21,17 +21,20 @@ from cvtgs.evaluation.scorer import (
     ImageScores,
     Metrics,
     SceneScores,
-    check_seen,
     chosen_metrics,
     render_views,
     scene_scores,
 )
+from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.rendering import choose_backend
+from cvtgs.rendering import BackendName, choose_backend
+from cvtgs.rendering.projection import to_matrices
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.text import printable_name, short_repr, shown
 
 STAGE = "evaluate"  # stage name in progress events; one step per image
+SAMPLED = 4096  # about how many Gaussians tell whether a camera sees anything of a scene
+LEAST_COVER = 1e-4  # mean alpha that one image must reach if all centres are outside every image
 ROUNDING = 1e-3  # values of photographs may be outside [0, 1] by this much, as in half precision
 
 Images = UInt8[np.ndarray, "c h w 3"]
@@ -247,6 +250,30 @@ def _check_photographs(photographs: Float[Tensor, "c h w 3"], cameras: Cameras) 
     if not -ROUNDING <= low <= high <= 1 + ROUNDING:
         raise InvalidArgumentError(
             f"photographs must be in [0, 1], found values from {low:g} to {high:g}."
+        )
+
+
+def check_seen(
+    scene: GaussianScene, cameras: Cameras, *, name: str, backend: BackendName = "auto"
+) -> None:
+    """Raise if no camera sees anything of a scene, or one is no pinhole camera; warn if few see."""
+    to_matrices(cameras)  # alone, each would be "camera 0" in errors
+    is_drawn = scene.opacities >= MIN_ALPHA
+    points = scene.means[is_drawn] if bool(is_drawn.any()) else scene.means
+    if cameras.shows_any(points):
+        sample = points[:: -(-len(points) // SAMPLED)].cpu()
+        blind = sum(not camera.shows_any(sample) for camera in cameras.to("cpu").singles())
+        if 2 * blind > len(cameras):
+            warn(
+                f"{blind} of {len(cameras)} cameras see nothing of {name}; give cameras of this "
+                f"scene, in its axes and units."
+            )
+        return
+    images = (render_views(scene, camera, backend=backend) for camera in cameras.singles())
+    if not any(float(image.alpha.mean()) >= LEAST_COVER for image in images):
+        raise InvalidArgumentError(
+            f"the cameras must see {name}, found nothing of it in any of {len(cameras)} "
+            f"views; give cameras of this scene, in its axes and units."
         )
 
 

@@ -104,7 +104,8 @@ def read_image(
     with _opened(path), Image.open(path) as file:
         image: Image.Image = file
         if file.mode.startswith("I"):  # grey of 16 bits, which convert would clip at 255
-            image = Image.fromarray((np.asarray(file) >> 8).clip(0, 255).astype(np.uint8))
+            grey = np.asarray(file, dtype=np.float32) * (255 / 65535)
+            image = Image.fromarray(grey.round().clip(0, 255).astype(np.uint8))
         whole, mode = image.convert("RGBA"), file.mode
     if mode == "F":  # convert would make values from 0 to 1 black
         raise FileFormatError(f"{path}: must hold whole numbers, found an image of floats.")
@@ -294,7 +295,7 @@ def _find(folder: Path, name: str) -> Path | None:
             return exact
         base = exact.with_suffix("") if exact.suffix.lower() in SUFFIXES else exact
         for suffix in SUFFIXES:
-            for written in (suffix, suffix.upper()):
+            for written in (suffix, suffix.upper(), suffix.title()):
                 candidate = base.with_name(base.name + written)
                 if candidate.is_file():
                     return candidate

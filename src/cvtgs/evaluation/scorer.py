@@ -14,9 +14,7 @@ from cvtgs.config.base import Record
 from cvtgs.errors import CvtgsError, InvalidArgumentError
 from cvtgs.evaluation.lpips import LEAST_PIXELS, LpipsNetwork, LpipsWeights, load_lpips, lpips
 from cvtgs.evaluation.metrics import alpha_bias, alpha_error, pair_psnr, ssim
-from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.rendering import BackendName, render
-from cvtgs.rendering.projection import to_matrices
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
 
@@ -31,7 +29,6 @@ BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 MOST_PSNR = 60.0  # upper limit of PSNR where scores are compared, dB: closer images count as equal
 PIXELS_TOGETHER = 1 << 21  # of images that are rendered at once to be scored
-LEAST_COVER = 1e-4  # mean alpha that one image must reach if all centres are outside every image
 
 
 class Score(Record):
@@ -239,22 +236,6 @@ def render_views(
     """Render views of a scene, without gradients."""
     found = render(scene, cameras, backend=backend)
     return ViewImages(cameras=cameras, rgb=found.rgb, alpha=found.alpha)
-
-
-def check_seen(
-    scene: GaussianScene, cameras: Cameras, *, name: str, backend: BackendName = "auto"
-) -> None:
-    """Raise if no camera sees anything of a scene, or one is no pinhole camera."""
-    to_matrices(cameras)  # alone, each would be "camera 0" in errors
-    is_drawn = scene.opacities >= MIN_ALPHA
-    if cameras.shows_any(scene.means[is_drawn] if bool(is_drawn.any()) else scene.means):
-        return
-    images = (render_views(scene, camera, backend=backend) for camera in cameras.singles())
-    if not any(float(image.alpha.mean()) >= LEAST_COVER for image in images):
-        raise InvalidArgumentError(
-            f"the cameras must see {name}, found nothing of it in any of {len(cameras)} "
-            f"views; give cameras of this scene, in its axes and units."
-        )
 
 
 class ImageScores(NamedTuple):

@@ -19,7 +19,7 @@ from cvtgs.counts import checked_whole, shared_out, shortfall, target_count, who
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
 from cvtgs.edit import concatenate
 from cvtgs.errors import ConfigError, DroppedDataWarning, check_path, warn
-from cvtgs.evaluation.scorer import check_seen
+from cvtgs.evaluation.compare import check_seen
 from cvtgs.grouping import finer_count, most_cells
 from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES, checked_axes
@@ -155,7 +155,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         room -= IMAGE_BYTES
         if cameras is not None:
             check_seen(read_sample(rows, SAMPLED), cameras, name="the scene")
-        elif source_axes is None:
+        elif source_axes in (None, SCENE_AXES):
             own = find_own_cameras(read_sample(rows, SAMPLED), source)
             cameras = None if own is None else own.cameras
     allocation = simplifier.config.allocation

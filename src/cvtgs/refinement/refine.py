@@ -12,7 +12,8 @@ from cvtgs.config import RefineConfig
 from cvtgs.counts import checked_whole
 from cvtgs.devices import chosen_device, threads_for_chunks, without_autocast
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError, warn
-from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer, check_seen
+from cvtgs.evaluation.compare import check_seen
+from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.refinement.images import ImageBuffer, generated_views, shared_views, split_views
 from cvtgs.refinement.optimize import STAGE, Limits, learning_rate_scales, optimize
