@@ -226,6 +226,10 @@ def test_a_stream_is_written_into_new_folders_and_may_lack_gaussians(tmp_path, c
     assert main([*words, "-o", str(tmp_path / "new" / "out")]) == 0
     assert (tmp_path / "new" / "out" / "lod-meta.json").is_file()
     assert "Fewer than the requested 60: only 59 of 60 Gaussians are" in capsys.readouterr().out
+    save(scene[4:], tmp_path / "a.spz")
+    words[1] = str(tmp_path / "a.spz")
+    assert main([*words, "-o", str(tmp_path / "other"), "--memory", "4GB"]) == 0
+    assert "--memory has an effect on binary .ply files only." in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -223,6 +223,8 @@ def stream_levels(
     errors = [level.geometric_error for level in plan.levels]
     if made[0].report.shortfall and not options.quiet:
         say(shortfall_note(made[0].report))
+    if options.memory is not None and options.input.suffix != ".ply" and not options.quiet:
+        say("In one piece: --memory has an effect on binary .ply files only.")
     _print_levels(options, len(plan.chunks), written, errors=errors)
 
 
