@@ -106,7 +106,7 @@ def report(table: Table, options: argparse.Namespace) -> str:
         f"`python -m benchmarks.ablation {scenes} -o FOLDER` makes this table (with "
         "`--lpips WEIGHTS` for LPIPS).\n\n"
         f"Scenes: {', '.join(table)}. "
-        f"Judge: {judge_of(options)}. "
+        f"Judge: {judge_of(options, options.files)}. "
         f"cvtgs {cvtgs.__version__}, checkpoints: {nets}.\n\n"
         f"{markdown(table, options.rho, means_only=options.means)}"
     )

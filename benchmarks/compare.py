@@ -17,7 +17,7 @@ Scenes and scorers are chosen as in ``benchmarks.quality``; ``--cameras CAPTURE 
 --images DIR`` scores against photographs. Run it once on a small scene first, so that compiled
 code is compiled and cached. ``--results FILE`` adds the results to those in the file and shows
 all of them, so that methods can be run one by one; ``--methods`` without names only shows them.
-Results in the file must be of the same cameras, size and background. ``--outputs DIR`` keeps every
+Results of a scene must be of the same cameras, size and background. ``--outputs DIR`` keeps every
 file that a method wrote, with its seconds, and reuses a kept file of the same command, scene and
 count instead of running the method again. ``--set`` changes the presets, which then have the
 settings in their names.
@@ -48,7 +48,7 @@ from benchmarks.compare_tables import (
     results_json,
     wrong_counts,
 )
-from benchmarks.measuring import Cost, machine, run, write_file
+from benchmarks.measuring import Cost, machine, names_of, run, write_file
 from benchmarks.quality import Scorer, judge_of, make_scorer, scenes, scoring_parser
 from cvtgs.errors import MissingDependencyError
 
@@ -77,12 +77,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     commands = commands_of(options)
     text = ""
     known = {} if options.results is None else read_results(options.results)
-    for judge in judges_of(known) if commands else []:
-        if judge != judge_of(options):
-            raise SystemExit(
-                f"--results: {options.results} has results of another judge ({judge}); "
-                f"this is {judge_of(options)}. Name another file."
-            )
+    if commands:
+        check_judges(known, options)
     for measured in measure(commands, options) if commands else [{}]:
         table = joined(known, measured)
         if options.results is not None:
@@ -98,6 +94,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if plot is not None:
                 write_file(options.output / "compare.png", plot)
     print(text)
+
+
+def check_judges(known: Table, options: argparse.Namespace) -> None:
+    """Raise if known results of the scenes were scored by other images than these options ask."""
+    scored = {
+        name: [file] for name, file in zip(names_of(options.files), options.files, strict=True)
+    }
+    for name, files in (scored or {kind: [] for kind in cvtgs.synthetic.KINDS}).items():
+        here = judge_of(options, files)
+        for judge in judges_of({name: known.get(name, {})}):
+            if judge != here:
+                raise SystemExit(
+                    f"--results: {options.results} has results of {name} by another judge "
+                    f"({judge}); this is {here}. Name another file."
+                )
 
 
 def parser() -> argparse.ArgumentParser:
@@ -172,8 +183,9 @@ def measure(commands: Mapping[str, list[str]], options: argparse.Namespace) -> I
                     count = cvtgs.target_count(len(scene), rho)
                     task = Task(source=source, rho=rho, count=count, output=place)
                     runs[method, task] = attempt(command, task, keep=options.outputs is not None)
-            score = make_scorer(options, options.files[len(table)] if options.files else None)
-            table[scene_name] = judged(scene, runs, score=score, judge=judge_of(options))
+            file = options.files[len(table)] if options.files else None
+            judge = judge_of(options, [] if file is None else [file])
+            table[scene_name] = judged(scene, runs, score=make_scorer(options, file), judge=judge)
             print(f"compared on {scene_name}: {len(scene)} Gaussians", file=sys.stderr)
             yield dict(table)
 
@@ -203,7 +215,7 @@ def attempt(command: Sequence[str], task: Task, *, keep: bool) -> Run | None:
     made_by = {"command": list(command), "count": task.count, "scene": digest_of(task.source)}
     if keep and output.is_file() and costs.is_file():
         kept = json.loads(costs.read_text(encoding="utf-8"))
-        if kept["made_by"] == made_by:
+        if kept.get("made_by") == made_by:
             return cvtgs.load(output), Cost(**kept["cost"])
     output.unlink(missing_ok=True)
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -261,7 +273,7 @@ def judged(
 
 def report(table: Table, options: argparse.Namespace) -> str:
     """Return the report: settings, tables, wrong counts and failures."""
-    judge = "; ".join(judges_of(table)) or judge_of(options)
+    judge = "; ".join(judges_of(table)) or judge_of(options, options.files)
     clock = "wall-clock" if options.clock == "wall" else "user CPU"
     parts = [
         f"Scenes: {', '.join(table)}. Judge: {judge}. "

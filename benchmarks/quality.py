@@ -177,22 +177,22 @@ def make_scorer(options: argparse.Namespace, file: Path | None) -> Scorer:
     return own_scorer(weights, cameras, background=background, size=options.size or SIZE)
 
 
-def judge_of(options: argparse.Namespace) -> str:
-    """Describe the scorer that the options ask for: renderer, cameras, size and background."""
+def judge_of(options: argparse.Namespace, files: Sequence[Path]) -> str:
+    """Describe the scorer of some files (none for generated scenes) that the options ask for."""
     if options.scorer:
-        return "the command of --scorer"
+        return f"the command {options.scorer}"
     size = f"{options.size or SIZE} pixels"
     automatic = f"{VIEWS} automatic views of {size}"
     if options.cameras is not None:
         part = f" ({options.split})" if options.split else ""
-        cameras = f"the cameras of --cameras{part}"
-        cameras += " against photographs" if options.images is not None else ""
-    elif not any(cameras_file(file).is_file() for file in options.files):
+        cameras = f"the cameras of {options.cameras}{part}"
+        cameras += f" against the photographs in {options.images}" if options.images else ""
+    elif not any(cameras_file(file).is_file() for file in files):
         cameras = automatic
     else:
         cameras = "cameras beside the scenes"
         cameras += f" at {size}" if options.size is not None else ""
-        if not all(cameras_file(file).is_file() for file in options.files):
+        if not all(cameras_file(file).is_file() for file in files):
             cameras += f", {automatic} where there are none"
     return f"cvtgs' own renderer, {cameras}, over {options.background}"
 

@@ -317,6 +317,14 @@ def test_a_section_of_a_file_that_is_none_is_named(tmp_path):
         SimplifyConfig.compose(file=path, settings={"cvt.iterations": "4"})
 
 
+@pytest.mark.parametrize(
+    "key", ["visibility.size", "visibility.views", "refine.steps", "refine.heldout"]
+)
+def test_numbers_that_no_machine_can_do_are_refused(key):
+    for text in (str(10**19), "9" * 400):
+        assert compose_error(settings={key: text}).startswith(f"{key}: ")
+
+
 def test_errors_of_the_command_line_do_not_blame_the_file(tmp_path):
     path = tmp_path / "a.toml"
     path.write_text("[cvt]\ncolor = 0.1\n")

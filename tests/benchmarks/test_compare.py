@@ -132,7 +132,7 @@ def test_another_judge_and_lpips(file, tmp_path, capsys):
     text = capsys.readouterr().out
     assert rows_of(text)[0] == ["method", "PSNR", "SSIM", "s"]
     assert rows_of(text)[2][1:3] == ["7.00", "1.0000"]
-    assert "Judge: the command of --scorer" in text
+    assert f"Judge: the command {sys.executable} " in text
 
 
 def test_settings_reach_cvtgs_and_all_methods_run_by_default():
@@ -273,18 +273,21 @@ def test_results_of_another_judge_are_not_mixed(file, tmp_path):
     scored = {"thing": {"x": {0.1: replace(result(20.0), judge="another")}}}
     (tmp_path / "results.json").write_text(compare_tables.results_json(scored))
     arguments = [str(file), "--results", str(tmp_path / "results.json"), "--methods", "draft"]
-    with pytest.raises(SystemExit, match="results of another judge \\(another\\); this is cvtgs'"):
+    with pytest.raises(
+        SystemExit, match="results of thing by another judge \\(another\\); this is cvtgs'"
+    ):
         compare.main(arguments)
     assert compare_tables.judges_of(scored) == ["another"]
 
 
 def test_the_judge_is_described(file):
     def described(*arguments: str) -> str:
-        return quality.judge_of(quality.scoring_parser("").parse_args([str(file), *arguments]))
+        options = quality.scoring_parser("").parse_args([str(file), *arguments])
+        return quality.judge_of(options, options.files)
 
     assert described("--size", "64").endswith("2 automatic views of 64 pixels, over black")
     assert described("--cameras", "a", "--split", "test").endswith(
-        "of --cameras (test), over black"
+        "cameras of a (test), over black"
     )
     file.with_suffix(".cameras.json").touch()
     assert described("--size", "64").endswith("cameras beside the scenes at 64 pixels, over black")
@@ -341,7 +344,7 @@ def test_photographs_judge_instead_of_the_full_scene(file, tmp_path, capsys):
     head, _, pruned, copied = rows_of(text)[:4]
     assert head == ["method", "PSNR", "SSIM", "s"]
     assert float(copied[1]) > 45 > float(pruned[1])
-    assert "the cameras of --cameras against photographs" in text
+    assert f"the cameras of {folder} against the photographs in {folder}, over black" in text
 
 
 @pytest.mark.parametrize(

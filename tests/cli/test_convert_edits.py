@@ -194,8 +194,8 @@ def test_quiet_conversions_warn_of_what_edits_lose(
     save(scene, source)
     save(replace(scene, comments=(TWO_SCALES.text,)), flat)
     for more, lost in (
-        (["--translate=4500000,0,0"], "out.ply: lost digits of positions (steps of 0."),
-        (["--merge", str(source)], "out.ply: lost the tag '"),
+        (["--translate=4500000,0,0"], "flat.ply: lost digits of positions (steps of 0."),
+        (["--merge", str(source)], "flat.ply: lost the tag '"),
     ):
         words = ["convert", str(flat), str(tmp_path / "out.ply"), *more, "--overwrite", "--quiet"]
         assert main(words) == 0

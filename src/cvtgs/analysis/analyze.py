@@ -108,7 +108,7 @@ def analyze(
         Frame, areas, visibility and effect plan.
 
     Raises:
-        InvalidArgumentError: The scene is none, or empty.
+        InvalidArgumentError: An argument has another type, or the scene is empty.
 
     Example:
         >>> from cvtgs.synthetic import scene as make

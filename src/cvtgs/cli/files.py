@@ -380,7 +380,7 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
         say_wrapped(f"Lost: {'; '.join([*phrases, *lost.dropped]) or rest}.", file=stream)
     unasked = [phrase for phrase in phrases if phrase.startswith((LOST_DIGITS, "the tag"))]
     if options.quiet and unasked:  # columns and what the format cannot hold have warnings already
-        warn(f"{options.output}: lost {'; '.join(unasked)}.", DroppedDataWarning)
+        warn(f"{options.input}: lost {'; '.join(unasked)}.", DroppedDataWarning)
     with nullcontext() if options.quiet else without_warnings(DroppedDataWarning):
         cvtgs.io.save(
             scene,
