@@ -10,7 +10,7 @@ from cvtgs.errors import ConfigError
 
 Share = Annotated[float, pydantic.Field(ge=0.0, le=1.0)]
 Rate = Annotated[float, pydantic.Field(ge=0.0)]
-Count = Annotated[int, pydantic.Field(ge=1, le=1_000_000)]
+Count = Annotated[int, pydantic.Field(ge=1, le=1_000_000_000)]
 Stride = Annotated[int, pydantic.Field(ge=1, le=64)]
 Factor = Annotated[float, pydantic.Field(ge=0.0, le=1e9)]  # its square fits into float32
 Ridge = Annotated[float, pydantic.Field(ge=1e-9, le=1e9)]  # products of two fit into float32
@@ -111,9 +111,9 @@ class TessellationConfig(Section):
     color: Factor = 0.05
     color_power: float = pydantic.Field(default=-0.25, ge=-1.0, le=1.0)
     seeding: Literal["stratified", "weighted"] = "stratified"
-    iterations: int = pydantic.Field(default=2, ge=0, le=1_000_000)
+    iterations: int = pydantic.Field(default=2, ge=0, le=1_000_000_000)
     tolerance: Factor = 1e-3
-    samples_per_site: int = pydantic.Field(default=3, ge=0, le=1_000_000)
+    samples_per_site: int = pydantic.Field(default=3, ge=0, le=1_000_000_000)
 
 
 class AllocationConfig(Section):
@@ -182,7 +182,7 @@ class VisibilityConfig(ImageSection):
             so that Gaussians that no image shows also count.
     """
 
-    views: int = pydantic.Field(default=0, ge=0, le=1_000_000)
+    views: int = pydantic.Field(default=0, ge=0, le=1_000_000_000)
     mass_share: Share = 0.3
 
 
@@ -204,8 +204,8 @@ class MatchConfig(Section):
             allocates once.
     """
 
-    opacity_rounds: int = pydantic.Field(default=0, ge=0, le=1_000_000)
-    color_iterations: int = pydantic.Field(default=0, ge=0, le=1_000_000)
+    opacity_rounds: int = pydantic.Field(default=0, ge=0, le=1_000_000_000)
+    color_iterations: int = pydantic.Field(default=0, ge=0, le=1_000_000_000)
     color_ridge: Ridge = 0.25
     band_ridge: Ridge = 8.0
     error_power: float = pydantic.Field(default=0.0, ge=0.0, le=2.0)
@@ -312,7 +312,7 @@ class RefineConfig(ImageSection):
         0.04
     """
 
-    steps: int = pydantic.Field(default=0, ge=0, le=1_000_000)
+    steps: int = pydantic.Field(default=0, ge=0, le=1_000_000_000)
     images_per_step: Count = 1
     seconds: float = pydantic.Field(default=0.0, ge=0.0)
     rates: Rates = Rates()

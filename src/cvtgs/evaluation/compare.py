@@ -33,6 +33,7 @@ from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.text import printable_name, short_repr, shown
 
 STAGE = "evaluate"  # stage name in progress events; one step per image
+PREVIEW = 96  # longer side of images that only tell whether they show anything, pixels
 SAMPLED = 4096  # about how many Gaussians tell whether a camera sees anything of a scene
 LEAST_COVER = 1e-4  # mean alpha that one image must reach if all centres are outside every image
 ROUNDING = 1e-3  # values of photographs may be outside [0, 1] by this much, as in half precision
@@ -260,21 +261,26 @@ def check_seen(
     to_matrices(cameras)  # alone, each would be "camera 0" in errors
     is_drawn = scene.opacities >= MIN_ALPHA
     points = scene.means[is_drawn] if bool(is_drawn.any()) else scene.means
-    if cameras.shows_any(points):
-        sample = points[:: -(-len(points) // SAMPLED)].cpu()
-        blind = sum(not camera.shows_any(sample) for camera in cameras.to("cpu").singles())
-        if 2 * blind > len(cameras):
-            warn(
-                f"{blind} of {len(cameras)} cameras see nothing of {name}; give cameras of this "
-                f"scene, in its axes and units."
-            )
+    sample = points[:: -(-len(points) // SAMPLED)].double().cpu()
+    blind = [one for one in cameras.to("cpu").singles() if not one.shows_any(sample)]
+    if 2 * len(blind) <= len(cameras):
         return
-    images = (render_views(scene, camera, backend=backend) for camera in cameras.singles())
-    if not any(float(image.alpha.mean()) >= LEAST_COVER for image in images):
+    empty = sum(_is_empty(scene, camera.fitted(PREVIEW), backend) for camera in blind)
+    if empty == len(cameras) and not cameras.shows_any(points):
         raise InvalidArgumentError(
             f"the cameras must see {name}, found nothing of it in any of {len(cameras)} "
             f"views; give cameras of this scene, in its axes and units."
         )
+    if 2 * empty > len(cameras):
+        warn(
+            f"{empty} of {len(cameras)} cameras see nothing of {name}; give cameras of this "
+            f"scene, in its axes and units."
+        )
+
+
+def _is_empty(scene: GaussianScene, camera: Cameras, backend: BackendName) -> bool:
+    """Return whether an image shows nothing, though Gaussians beside it may reach into it."""
+    return float(render_views(scene, camera, backend=backend).alpha.mean()) < LEAST_COVER
 
 
 @torch.no_grad()
