@@ -212,7 +212,9 @@ Run = tuple[cvtgs.GaussianScene, Cost]
 def attempt(command: Sequence[str], task: Task, *, keep: bool) -> Run | None:
     """Run a method's command on a task, or load its kept file; return None on failure."""
     output, costs = task.output, task.output.with_suffix(".json")
-    made_by = {"command": list(command), "count": task.count, "scene": digest_of(task.source)}
+    made_by = {"command": list(command), "count": task.count}
+    if keep:
+        made_by["scene"] = digest_of(task.source)
     if keep and output.is_file() and costs.is_file():
         kept = json.loads(costs.read_text(encoding="utf-8"))
         if kept.get("made_by") == made_by:

@@ -24,7 +24,7 @@ import torch
 
 import cvtgs
 from benchmarks.cameras import cameras_beside, cameras_file, spread_cameras
-from benchmarks.measuring import cores, machine, run_python
+from benchmarks.measuring import cores, machine, names_of, run_python
 from benchmarks.quality import score_views
 from cvtgs.cameras import Cameras
 from cvtgs.outofcore import simplify_file
@@ -166,7 +166,8 @@ def make(options: argparse.Namespace) -> None:
 def scenes(options: argparse.Namespace) -> list[tuple[str, cvtgs.GaussianScene]]:
     """Return the scenes to compare on."""
     if options.files:
-        return [(file.stem, cvtgs.load(file)) for file in options.files]
+        named = zip(names_of(options.files), options.files, strict=True)
+        return [(name, cvtgs.load(file)) for name, file in named]
     make_one, kinds = cvtgs.synthetic.scene, options.kinds.split(",")
     return [(kind, make_one(kind, options.count, sh_degree=1, seed=3)) for kind in kinds]
 
@@ -175,7 +176,8 @@ def seen_scenes(
     options: argparse.Namespace,
 ) -> Iterator[tuple[str, cvtgs.GaussianScene, Cameras]]:
     """Yield the scenes with the cameras beside them; automatic views where there are none."""
-    beside = {file.stem: file for file in options.files if cameras_file(file).is_file()}
+    named = zip(names_of(options.files), options.files, strict=True)
+    beside = {name: file for name, file in named if cameras_file(file).is_file()}
     for name, scene in scenes(options):
         if name in beside:
             yield name, scene, cameras_beside(beside[name])

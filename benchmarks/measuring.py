@@ -5,7 +5,6 @@ import platform
 import statistics
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -105,19 +104,20 @@ def generated_scenes(
 
 
 def names_of(files: Sequence[Path]) -> list[str]:
-    """Return a name for each file: its stem, or folder and name if others have the same stem.
+    """Return a name for each file: its stem, after as many folders as tell it from the others.
 
     Raises:
-        SystemExit: Two names would be the same.
+        SystemExit: A file is given twice, or two names would be the same.
     """
-    stems = Counter(file.stem for file in files)
-    names = [
-        file.stem if stems[file.stem] == 1 else f"{file.resolve().parent.name}-{file.name}"
-        for file in files
-    ]
-    for name, count in Counter(names).items():
-        if count > 1:
-            raise SystemExit(f"{name}: {count} files must not have the same folder and name.")
+    names, places = [file.stem for file in files], [file.resolve() for file in files]
+    for depth in range(2, max((len(place.parts) for place in places), default=0)):
+        names = [
+            name if names.count(name) == 1 else "-".join(place.parts[-depth:])
+            for name, place in zip(names, places, strict=True)
+        ]
+    for name in names:
+        if names.count(name) > 1:
+            raise SystemExit(f"{name}: is given {names.count(name)} times.")
     return names
 
 

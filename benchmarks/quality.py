@@ -181,8 +181,8 @@ def judge_of(options: argparse.Namespace, files: Sequence[Path]) -> str:
     """Describe the scorer of some files (none for generated scenes) that the options ask for."""
     if options.scorer:
         return f"the command {options.scorer}"
-    size = f"{options.size or SIZE} pixels"
-    automatic = f"{VIEWS} automatic views of {size}"
+    side = options.size or SIZE
+    automatic = f"{VIEWS} automatic views of {side} x {side} pixels"
     if options.cameras is not None:
         part = f" ({options.split})" if options.split else ""
         cameras = f"the cameras of {options.cameras}{part}"
@@ -191,7 +191,7 @@ def judge_of(options: argparse.Namespace, files: Sequence[Path]) -> str:
         cameras = automatic
     else:
         cameras = "cameras beside the scenes"
-        cameras += f" at {size}" if options.size is not None else ""
+        cameras += f" at {side} pixels" if options.size is not None else ""
         if not all(cameras_file(file).is_file() for file in files):
             cameras += f", {automatic} where there are none"
     return f"cvtgs' own renderer, {cameras}, over {options.background}"

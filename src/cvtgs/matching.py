@@ -99,7 +99,7 @@ def fit_colors(
         The scene with new colours; the same object if there are no iterations.
 
     Raises:
-        InvalidArgumentError: ``views`` are no observed views, or ``frozen`` is out of range.
+        InvalidArgumentError: An argument has another type, or ``frozen`` is out of range.
 
     Example:
         >>> from cvtgs.rendering import observe
@@ -238,7 +238,7 @@ def cell_contributions(
         Contribution of every cell, pixels.
 
     Raises:
-        InvalidArgumentError: There are fewer contributions than members.
+        InvalidArgumentError: There are fewer contributions than members, or these are no floats.
 
     Example:
         >>> cells = Partition.from_labels(torch.tensor([1, 0, 1]), 2)

@@ -100,7 +100,7 @@ def test_the_table_has_the_scores_of_the_baseline(file, capsys, background):
         f"{found.ssim.mean:.4f}",
         f"{found.alpha_error.mean:.4f}",
     ]
-    assert f"renderer, 2 automatic views of 48 pixels, over {background}. " in text
+    assert f"renderer, 2 automatic views of 48 x 48 pixels, over {background}. " in text
 
 
 @pytest.mark.long
@@ -285,7 +285,7 @@ def test_the_judge_is_described(file):
         options = quality.scoring_parser("").parse_args([str(file), *arguments])
         return quality.judge_of(options, options.files)
 
-    assert described("--size", "64").endswith("2 automatic views of 64 pixels, over black")
+    assert described("--size", "64").endswith("2 automatic views of 64 x 64 pixels, over black")
     assert described("--cameras", "a", "--split", "test").endswith(
         "cameras of a (test), over black"
     )
@@ -296,9 +296,9 @@ def test_the_judge_is_described(file):
 def test_scenes_of_one_name_are_told_apart(tmp_path):
     files = [tmp_path / part for part in ("a/x.ply", "b/x.ply", "b/x.spz", "b/y.ply")]
     assert names_of(files) == ["a-x.ply", "b-x.ply", "b-x.spz", "y"]
-    with pytest.raises(
-        SystemExit, match=r"b-x\.ply: 2 files must not have the same folder and name"
-    ):
+    models = [tmp_path / name / "point_cloud" / "point_cloud.ply" for name in ("a", "b")]
+    assert names_of(models) == [f"{name}-point_cloud-point_cloud.ply" for name in ("a", "b")]
+    with pytest.raises(SystemExit, match=r"x\.ply: is given 2 times\."):
         names_of([files[1], files[1]])
 
 

@@ -51,7 +51,7 @@ def test_grey_of_16_bits_is_that_of_8(suffix, tmp_path):
             assert (found[:, :, channel] * 255).round().byte().numpy().tolist() == values.tolist()
 
 
-def test_suffixes_may_be_written_in_any_case(tmp_path):
+def test_a_suffix_may_start_with_a_capital(tmp_path):
     one = cvtgs.Cameras(
         viewmats=torch.eye(4)[None], Ks=torch.eye(3)[None], width=8, height=8, names=("a.jpg",)
     )

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 STREAMS = ("sog", "3dtiles")
 OF_STREAMS = ("chunk", "environment", "memory", "workers", "scheduler", "place", "transform")
+KIND_OF = {"environment": " sog", "place": " 3dtiles", "transform": " 3dtiles"}
 OF_SCORES = {"views": None, "size": None, "background": "black", "backend": "auto"}
 """Options of scores, and their defaults."""
 
@@ -75,7 +76,7 @@ def check_stream_options(options: argparse.Namespace) -> None:
     if options.stream is None:
         for name in OF_STREAMS:
             if getattr(options, name) is not None:
-                kind = " 3dtiles" if name in ("place", "transform") else ""
+                kind = KIND_OF.get(name, "")
                 raise InvalidArgumentError(f"--{name} needs --stream{kind}.")
         return
     excluded = [name for name in ("viewer", "suffix") if getattr(options, name)] + scoring

@@ -78,6 +78,10 @@ def gaussian_weights(
     Returns:
         Weights in float64.
 
+    Raises:
+        InvalidArgumentError: ``area_power`` is negative or not finite, or shapes or types do not
+            fit.
+
     Example:
         >>> gaussian_weights(torch.tensor([0.5]), torch.tensor([4.0]), area_power=0.5).tolist()
         [1.0]

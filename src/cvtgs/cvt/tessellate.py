@@ -286,7 +286,7 @@ def lloyd(
 
     Raises:
         InvalidArgumentError: Shapes do not fit together, ``iterations`` or ``tolerance`` is
-            negative, or the energy is negative or not finite.
+            negative, or ``tolerance`` or the energy is not a finite number of at least 0.
 
     Example:
         >>> from cvtgs.cvt import nearest_scipy
