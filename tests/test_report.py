@@ -19,10 +19,15 @@ from cvtgs import (
     render,
 )
 from cvtgs.analysis import analyze
-from cvtgs.cells import Partition
+from cvtgs.cells import Descriptors, Partition
 from cvtgs.clock import StageClock, StageCost, peak_memory_bytes
-from cvtgs.mergenet import load_checkpoint
+from cvtgs.cvt import Tessellation
+from cvtgs.evaluation import Comparison, LpipsWeights
+from cvtgs.mergenet import Residuals, load_checkpoint
 from cvtgs.progress import silent
+from cvtgs.rendering import ObservedViews
+from cvtgs.text import short_repr
+from cvtgs.views import CameraPositions
 from scenes import random_scene
 
 CPU = torch.device("cpu")
@@ -142,6 +147,22 @@ def test_the_silent_listener_prints_nothing(capsys):
 def test_records_with_dictionaries_are_not_hashable():
     assert not isinstance(report_of(), Hashable)
     assert not isinstance(describe(random_scene(3)), Hashable)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        CameraPositions,
+        Comparison,
+        Descriptors,
+        LpipsWeights,
+        ObservedViews,
+        Residuals,
+        Tessellation,
+    ],
+)
+def test_values_of_many_numbers_have_a_short_repr(kind):
+    assert kind.__repr__ is short_repr
 
 
 def test_objects_with_tensors_have_a_short_repr():

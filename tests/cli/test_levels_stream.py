@@ -168,6 +168,7 @@ def test_levels_fitted_to_cameras_that_score_are_mentioned(tmp_path, capsys):
     given, split = ["--cameras", str(cameras)], ["--split", "test"]
     for preset, more, is_mentioned in (
         ("matched", [], True),
+        ("matched", ["--axes", "rdf"], True),
         ("matched", given, True),
         ("matched", [*given, *split], False),
         ("draft", given, False),

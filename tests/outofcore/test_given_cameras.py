@@ -296,15 +296,17 @@ def two_blocks(monkeypatch):
 
 @pytest.mark.long
 @pytest.mark.usefixtures("two_blocks")
-@pytest.mark.parametrize("is_given", [True, False])
-def test_cameras_of_a_capture_are_used_in_blocks(capsys, tmp_path, scene, is_given):
+@pytest.mark.parametrize(
+    ("is_given", "axes"), [(True, []), (False, []), (False, ["--axes", "rdf"])]
+)
+def test_cameras_of_a_capture_are_used_in_blocks(capsys, tmp_path, scene, is_given, axes):
     cvtgs.save(scene, tmp_path / "in.ply")
     folder = tmp_path / "elsewhere" if is_given else tmp_path
     write_json(folder / "transforms.json", transforms())
     words = ["simplify", tmp_path / "in.ply", tmp_path / "out.ply", "--preset", "matched"]
     words += ["--set", "visibility.views=4", "--set", "match.color_iterations=2"]
     words += ["--memory", "1GB", "--workers", "1", "--rho", "0.05", "--report"]
-    words += [tmp_path / "report.json", *(["--cameras", folder] if is_given else [])]
+    words += [tmp_path / "report.json", *(["--cameras", folder] if is_given else []), *axes]
     assert main([str(word) for word in words]) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert ("Rendered from 10 cameras found beside" in text) != is_given
