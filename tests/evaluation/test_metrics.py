@@ -228,6 +228,18 @@ def test_cameras_most_of_which_see_nothing_are_a_warning(blind: int) -> None:
     expected = pytest.warns(UserWarning, match=r"^2 of 3 cameras see nothing of it; give cameras")
     with expected if blind == 2 else nullcontext():
         check_seen(scene, cameras, name="it")
+    check_seen(scene, cameras, name="it", is_sample=True)
+
+
+def test_cameras_that_see_a_few_gaussians_of_many_are_not_blind() -> None:
+    """Every second of them is sampled; one of the others is small, faint and in sight."""
+    means = torch.tensor([0.0, 0.0, -3.0]).repeat(8192, 1)
+    means[1, 2] = 3.0
+    scales, faint = torch.full((8192, 3), -9.0), torch.full((8192,), -4.0)
+    scene = random_scene(8192).with_tensors(means=means, log_scales=scales, logit_opacities=faint)
+    intrinsics = torch.tensor([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]]).expand(3, 3, 3)
+    poses = torch.eye(4).repeat(3, 1, 1)
+    check_seen(scene, Cameras(viewmats=poses, Ks=intrinsics, width=16, height=16), name="it")
 
 
 def test_a_scene_nearer_than_the_near_plane_is_not_seen() -> None:

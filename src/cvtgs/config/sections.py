@@ -11,7 +11,8 @@ from cvtgs.errors import ConfigError
 Share = Annotated[float, pydantic.Field(ge=0.0, le=1.0)]
 Rate = Annotated[float, pydantic.Field(ge=0.0)]
 Count = Annotated[int, pydantic.Field(ge=1, le=1_000_000_000)]
-Stride = Annotated[int, pydantic.Field(ge=1, le=64)]
+CountOrZero = Annotated[int, pydantic.Field(ge=0, le=1_000_000_000)]
+UpTo64 = Annotated[int, pydantic.Field(ge=1, le=64)]
 Factor = Annotated[float, pydantic.Field(ge=0.0, le=1e9)]  # its square fits into float32
 Ridge = Annotated[float, pydantic.Field(ge=1e-9, le=1e9)]  # products of two fit into float32
 Choice = Literal["auto", "on", "off"]
@@ -111,9 +112,9 @@ class TessellationConfig(Section):
     color: Factor = 0.05
     color_power: float = pydantic.Field(default=-0.25, ge=-1.0, le=1.0)
     seeding: Literal["stratified", "weighted"] = "stratified"
-    iterations: int = pydantic.Field(default=2, ge=0, le=1_000_000_000)
+    iterations: CountOrZero = 2
     tolerance: Factor = 1e-3
-    samples_per_site: int = pydantic.Field(default=3, ge=0, le=1_000_000_000)
+    samples_per_site: CountOrZero = 3
 
 
 class AllocationConfig(Section):
@@ -163,8 +164,8 @@ class ImageSection(Section):
     """Base of the sections that render images of the scene."""
 
     size: int = pydantic.Field(default=128, ge=16, le=16_384)
-    stride: Stride = 1
-    fine_factor: Stride = 1
+    stride: UpTo64 = 1
+    fine_factor: UpTo64 = 1
 
 
 class VisibilityConfig(ImageSection):
@@ -182,7 +183,7 @@ class VisibilityConfig(ImageSection):
             so that Gaussians that no image shows also count.
     """
 
-    views: int = pydantic.Field(default=0, ge=0, le=1_000_000_000)
+    views: CountOrZero = 0
     mass_share: Share = 0.3
 
 
@@ -204,8 +205,8 @@ class MatchConfig(Section):
             allocates once.
     """
 
-    opacity_rounds: int = pydantic.Field(default=0, ge=0, le=1_000_000_000)
-    color_iterations: int = pydantic.Field(default=0, ge=0, le=1_000_000_000)
+    opacity_rounds: CountOrZero = 0
+    color_iterations: CountOrZero = 0
     color_ridge: Ridge = 0.25
     band_ridge: Ridge = 8.0
     error_power: float = pydantic.Field(default=0.0, ge=0.0, le=2.0)
@@ -312,7 +313,7 @@ class RefineConfig(ImageSection):
         0.04
     """
 
-    steps: int = pydantic.Field(default=0, ge=0, le=1_000_000_000)
+    steps: CountOrZero = 0
     images_per_step: Count = 1
     seconds: float = pydantic.Field(default=0.0, ge=0.0)
     rates: Rates = Rates()

@@ -255,23 +255,33 @@ def _check_photographs(photographs: Float[Tensor, "c h w 3"], cameras: Cameras) 
 
 
 def check_seen(
-    scene: GaussianScene, cameras: Cameras, *, name: str, backend: BackendName = "auto"
+    scene: GaussianScene,
+    cameras: Cameras,
+    *,
+    name: str,
+    backend: BackendName = "auto",
+    is_sample: bool = False,
 ) -> None:
-    """Raise if no camera sees anything of a scene, or one is no pinhole camera; warn if few see."""
+    """Raise if no camera sees anything of a scene, or one is no pinhole camera; warn if few see.
+
+    A sample of a scene cannot tell that a camera sees nothing, so there is no warning.
+    """
     to_matrices(cameras)  # alone, each would be "camera 0" in errors
     is_drawn = scene.opacities >= MIN_ALPHA
     points = scene.means[is_drawn] if bool(is_drawn.any()) else scene.means
-    sample = points[:: -(-len(points) // SAMPLED)].double().cpu()
-    blind = [one for one in cameras.to("cpu").singles() if not one.shows_any(sample)]
-    if 2 * len(blind) <= len(cameras):
-        return
+    blind = cameras.to("cpu").singles()
+    for some in (points[:: -(-len(points) // SAMPLED)].cpu(), points):  # all only in doubt
+        exact = some.double()
+        blind = [camera for camera in blind if not camera.shows_any(exact)]
+        if 2 * len(blind) <= len(cameras):
+            return
     empty = sum(_is_empty(scene, camera.fitted(PREVIEW), backend) for camera in blind)
-    if empty == len(cameras) and not cameras.shows_any(points):
+    if empty == len(cameras):
         raise InvalidArgumentError(
             f"the cameras must see {name}, found nothing of it in any of {len(cameras)} "
             f"views; give cameras of this scene, in its axes and units."
         )
-    if 2 * empty > len(cameras):
+    if 2 * empty > len(cameras) and not is_sample:
         warn(
             f"{empty} of {len(cameras)} cameras see nothing of {name}; give cameras of this "
             f"scene, in its axes and units."

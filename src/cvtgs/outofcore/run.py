@@ -154,7 +154,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     if simplifier.config.uses_images:
         room -= IMAGE_BYTES
         if cameras is not None:
-            check_seen(read_sample(rows, SAMPLED), cameras, name="the scene")
+            sample = read_sample(rows, SAMPLED)
+            check_seen(sample, cameras, name="the scene", is_sample=True)
         elif source_axes in (None, SCENE_AXES):
             own = find_own_cameras(read_sample(rows, SAMPLED), source)
             cameras = None if own is None else own.cameras
