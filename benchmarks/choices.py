@@ -37,7 +37,6 @@ from cvtgs.evaluation.scorer import (
     ImageScores,
     Metrics,
     chosen_metrics,
-    mean_of,
     render_views,
     scene_scores,
 )
@@ -174,18 +173,12 @@ def measure(
             small = simplifier.simplify(scene, rho, cameras=given)
             seconds = time.process_time() - start
             scores = scene_scores(name, len(small), list(score(small, full, metrics)))
-            assert scores.alpha_error is not None
-            assert scores.alpha_bias is not None
             yield Row(
                 scene=scene_name,
                 rho=rho,
                 name=name,
-                psnr=scores.psnr.mean,
-                ssim=scores.ssim.mean,
-                lpips=mean_of(scores.lpips),
-                alpha_error=scores.alpha_error.mean,
-                alpha_bias=scores.alpha_bias.mean,
                 seconds=seconds,
+                **scores.means(),
             )
             if options.pages:
                 kept[name] = small

@@ -40,7 +40,6 @@ from cvtgs.evaluation import (
     load_photographs,
     scorer as scorers,
 )
-from cvtgs.evaluation.scorer import mean_of
 from cvtgs.views import automatic_views
 
 VIEWS = 8
@@ -74,13 +73,7 @@ class Quality:
     @classmethod
     def of(cls, scores: SceneScores) -> Self:
         """Make a quality of the means of an evaluation."""
-        return cls(
-            psnr=scores.psnr.mean,
-            ssim=scores.ssim.mean,
-            lpips=mean_of(scores.lpips),
-            alpha_error=mean_of(scores.alpha_error),
-            alpha_bias=mean_of(scores.alpha_bias),
-        )
+        return cls(**scores.means())
 
 
 Simplify = Callable[[cvtgs.GaussianScene, float], cvtgs.GaussianScene]

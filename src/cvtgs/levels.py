@@ -12,11 +12,10 @@ from cvtgs.config.base import Record
 from cvtgs.counts import target_count, written, written_ratios
 from cvtgs.errors import InvalidArgumentError, check_path
 from cvtgs.evaluation import Evaluation, SceneScores
-from cvtgs.evaluation.scorer import mean_of
 from cvtgs.io import check_output, check_save, load, save
 from cvtgs.io.atomic import make_folder, write_atomically
 from cvtgs.io.axes import SCENE_AXES, checked_axes
-from cvtgs.report import Level
+from cvtgs.report import Level, check_one_scene
 from cvtgs.text import counted, printable_name, shown
 
 __all__ = ["LevelEntry", "LevelsIndex", "write_levels"]
@@ -68,15 +67,7 @@ class LevelEntry(Record):
         Returns:
             A new entry.
         """
-        return self.model_copy(
-            update={
-                "psnr": scores.psnr.mean,
-                "ssim": scores.ssim.mean,
-                "lpips": mean_of(scores.lpips),
-                "alpha_error": mean_of(scores.alpha_error),
-                "alpha_bias": mean_of(scores.alpha_bias),
-            }
-        )
+        return self.model_copy(update=scores.means())
 
 
 class LevelsIndex(Record):
@@ -167,11 +158,7 @@ def write_levels(
         raise InvalidArgumentError(
             f"levels must be those that Simplifier.levels returns, found {shown(levels)}."
         )
-    sizes = sorted({level.report.input_count for level in levels})
-    if len(sizes) > 1:
-        raise InvalidArgumentError(
-            f"levels must be of one scene, found scenes of {sizes[0]:,} and {sizes[1]:,} Gaussians."
-        )
+    check_one_scene(level.report.input_count for level in levels)
     check_path(source)
     check_path(folder)
     checked_axes(axes or SCENE_AXES)

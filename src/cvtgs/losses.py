@@ -1,6 +1,5 @@
 """Losses between rendered images and their targets."""
 
-import math
 from functools import cache
 from typing import Any
 
@@ -9,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.checks import check_kinds
-from cvtgs.counts import real_number
+from cvtgs.counts import check_not_negative, real_number
 from cvtgs.devices import without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import positive_log
@@ -263,10 +262,7 @@ def _image_loss(
 
 def _check_weights(**weights: float) -> None:
     for name, weight in weights.items():
-        if not 0 <= real_number(weight) < math.inf:
-            raise InvalidArgumentError(
-                f"{name} must be a finite number of at least 0, found {weight!r}."
-            )
+        check_not_negative(weight, name)
 
 
 def check_pair(

@@ -1,5 +1,6 @@
 """SimplifyReport and other reports: actions, dropped data and costs of a run."""
 
+from collections.abc import Iterable
 from functools import partial
 from pkgutil import resolve_name
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.clock import StageCost
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.scene import GaussianScene
 from cvtgs.text import counted
 
@@ -187,6 +189,15 @@ class Simplified(NamedTuple):
 def origin_of_views(cameras: Cameras | None) -> str:
     """Return the origin of rendered views: given cameras, or views that were generated."""
     return "found" if cameras is None else counted(len(cameras), "camera")
+
+
+def check_one_scene(counts: Iterable[int]) -> None:
+    """Check that levels are of one scene, by the number of its Gaussians that each states."""
+    sizes = sorted(set(counts))
+    if len(sizes) > 1:
+        raise InvalidArgumentError(
+            f"levels must be of one scene, found scenes of {sizes[0]:,} and {sizes[1]:,} Gaussians."
+        )
 
 
 class Level(NamedTuple):

@@ -72,18 +72,26 @@ def check_rows(scene: GaussianScene) -> CheckedScene:
     dropped = any_row(scene, invalid)
     count = int(dropped.sum())
     reasons = {name: int(mask.sum()) for name, mask in invalid.items()}
-    text = ", ".join(f"{name} {number:,}" for name, number in reasons.items())
     if count == len(scene):
         raise InvalidSceneError(
             f"none of the {len(scene):,} Gaussians is valid; "
-            f"found NaN, infinite or zero values in {text}."
+            f"found NaN, infinite or zero values in {_listed(reasons)}."
         )
+    warn_of_dropped(count, len(scene), reasons)
+    return CheckedScene(scene.select(~dropped), reasons, count, ~dropped)
+
+
+def warn_of_dropped(count: int, total: int, reasons: Mapping[str, int]) -> None:
+    """Warn that invalid rows were dropped; the reasons are numbers of rows by attribute."""
     warn(
-        f"dropped {count:,} of {len(scene):,} Gaussians with NaN, infinite or zero values "
-        f"({text}).",
+        f"dropped {count:,} of {total:,} Gaussians with NaN, infinite or zero values "
+        f"({_listed(reasons)}).",
         DroppedDataWarning,
     )
-    return CheckedScene(scene.select(~dropped), reasons, count, ~dropped)
+
+
+def _listed(reasons: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {number:,}" for name, number in reasons.items())
 
 
 def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:

@@ -34,7 +34,8 @@ def job_on_a_line(tmp_path, monkeypatch):
             range_rows=1,
         )
         counts = tuple(len(sites) for _, sites in blocks)
-        job.write_manifest(Manifest(key="", grouped=9, total=1, cells=counts, left_out_mass=0.0))
+        manifest = Manifest(key="", grouped=9, total=1, cells=counts, left_out_mass=0.0)
+        job.write_file("manifest.json", manifest.to_json().encode())
         for block, (points, sites) in enumerate(blocks):
             positions, weights = torch.tensor(points).T
             tensors = {"points": positions[:, None], "weights": weights}

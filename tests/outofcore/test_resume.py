@@ -1,6 +1,7 @@
 """A killed run continues with the missing steps, or starts over; no file is left behind."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,12 +17,14 @@ import cvtgs
 from cvtgs import SimplifyConfig
 from cvtgs.boxes import Box
 from cvtgs.errors import InputError, InvalidSceneError, OutputError
+from cvtgs.io.locks import hidden_path
 from cvtgs.io.ply import open_rows
 from cvtgs.io.tensors import save_tensors
 from cvtgs.mergenet import load_checkpoint
 from cvtgs.outofcore import simplify_file
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.memory import LEAST_BYTES
+from cvtgs.outofcore.resume import can_continue
 from cvtgs.outofcore.sort import Attempt
 from cvtgs.streams import stream_file
 from refine_cases import ring
@@ -319,6 +322,29 @@ def test_an_interrupt_before_all_rows_are_sorted_leaves_no_folder(source, tmp_pa
     with pytest.raises(KeyboardInterrupt):
         simplify_file(source, tmp_path / "out.ply", 0.05, blocks=3, listener=interrupt)
     assert [path.name for path in tmp_path.iterdir()] == ["in.ply"]
+
+
+@pytest.mark.parametrize(
+    "run",
+    [
+        partial(simplify_file, rho=0.05, blocks=3),
+        partial(stream_file, rhos=[0.5, 0.1], kind="sog", blocks=3),
+    ],
+)
+def test_a_finished_run_that_is_interrupted_is_not_offered_to_be_continued(
+    source, tmp_path, monkeypatch, run
+):
+    def interrupted(folder, **_):
+        if output.exists():  # before that, earlier files are removed
+            raise KeyboardInterrupt
+
+    output = tmp_path / "out"
+    output = output if run.func is stream_file else output.with_suffix(".ply")
+    monkeypatch.setattr(shutil, "rmtree", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(source, output)
+    assert hidden_path(output, "blocks").is_dir()
+    assert not can_continue(output)
 
 
 @pytest.mark.slow

@@ -258,9 +258,7 @@ class SimplifyConfig(Section):
         Raises:
             ConfigError: The file cannot be read, a key is unknown, or a value is out of range.
         """
-        if file is not None:
-            check_path(file)
-        values = {} if file is None else read_toml(Path(file))
+        values = {} if file is None else read_toml(file)
         if not isinstance(settings, Mapping | None) or not all(
             isinstance(key, str) for key in settings or {}
         ):
@@ -280,16 +278,11 @@ class SimplifyConfig(Section):
             return cls.from_mapping(values)
         except ConfigError:
             if file is not None:
-                cls._check_file(Path(file))
+                try:
+                    cls.from_mapping(read_toml(file))
+                except ConfigError as error:  # the file alone is no configuration
+                    raise ConfigError(f"{file}: {error}") from None
             raise
-
-    @classmethod
-    def _check_file(cls, file: Path) -> None:
-        """Raise an error that names a file if the file alone is no configuration."""
-        try:
-            cls.from_mapping(read_toml(file))
-        except ConfigError as error:
-            raise ConfigError(f"{file}: {error}") from None
 
     def to_toml(self) -> str:
         """Return the configuration as TOML text; :meth:`from_toml` reads it from a file.

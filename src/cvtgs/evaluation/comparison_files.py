@@ -26,8 +26,7 @@ from cvtgs.evaluation.images import (
     resized,
 )
 from cvtgs.evaluation.scorer import SceneScores
-from cvtgs.io import check_output
-from cvtgs.io.atomic import make_folder, write_atomically
+from cvtgs.io.atomic import check_outputs, write_atomically
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.text import counted, size_text
 
@@ -51,9 +50,7 @@ _TRIES = ((84, 1.0), (72, 1.0), (55, 1.0), (55, 0.7), (45, 0.5), (35, 0.35), (30
 
 def check_comparison_files(folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
     """Make the folder and check that the files can be written, before the work starts."""
-    make_folder(folder)
-    for name in (PAGE, SHEET, ERRORS):
-        check_output(Path(folder) / name, overwrite=overwrite)
+    check_outputs(folder, (PAGE, SHEET, ERRORS), overwrite=overwrite)
 
 
 def write_comparison(

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Self, get_args
+from typing import Any, Literal, NamedTuple, Self, get_args
 
 import torch
 from jaxtyping import Float
@@ -64,11 +64,6 @@ class Score(Record):
         return cls(mean=math.fsum(values) / len(values), views=tuple(values))
 
 
-def mean_of(score: Score | None) -> float | None:
-    """Return the mean of a score, or None if there is no score."""
-    return None if score is None else score.mean
-
-
 class SceneScores(Record):
     """Mean and per-view scores of the images of one scene.
 
@@ -91,6 +86,15 @@ class SceneScores(Record):
     lpips: Score | None = None
     alpha_error: Score | None = None
     alpha_bias: Score | None = None
+
+    def means(self) -> dict[str, Any]:
+        """Return the mean over the views of every score.
+
+        Returns:
+            Means by name; None for what was not measured.
+        """
+        scores = {name: value for name, value in self if name not in ("name", "count")}
+        return {name: None if score is None else score.mean for name, score in scores.items()}
 
 
 class Evaluation(Record):

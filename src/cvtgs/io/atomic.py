@@ -7,7 +7,7 @@ import secrets
 import stat
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PureWindowsPath
 from typing import BinaryIO
@@ -40,6 +40,15 @@ _OLD_SECONDS = 3600
 
 _WAITS = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Seconds to wait on Windows for programs that hold a file for a moment, such as virus scanners."""
+
+
+def check_outputs(
+    folder: str | os.PathLike[str], names: Iterable[str], *, overwrite: bool = False
+) -> None:
+    """Make a folder, and check that files in it could be written, before they are computed."""
+    make_folder(folder)
+    for name in names:
+        check_output(Path(folder) / name, overwrite=overwrite)
 
 
 def check_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> None:

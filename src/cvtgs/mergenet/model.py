@@ -199,7 +199,10 @@ class MergeNet(CellNetwork):
         others = _pulls(of_pairs, pair_positions, near).unflatten(0, shape).sum(dim=1)
         # Doubled, so that neighbours can turn a cell as much as a gate of 1 does.
         twists = pulls[:, 3:] + 2 * others[:, 3:]
-        known = self.known(summarize(descriptors)) * _visible_share(descriptors.cells[:, -1])
+        # Cells far below a pixel in size could not be seen from where pixels are measured, so
+        # people look at them from nearby, and what their size is there is unknown.
+        pixels = descriptors.cells[:, -1] / PIXEL_SCALE
+        known = self.known(summarize(descriptors)) * (pixels - (LEAST_PIXELS - 1)).clamp(0, 1)
         by_cell = known[:, None]
         return Residuals(
             d_means=(pulls[:, :3] + others[:, :3]) * by_cell,
@@ -274,15 +277,6 @@ def summarize(descriptors: Descriptors) -> Float[Tensor, "m f"]:
     near = pairs.mean(dim=1) if pairs.shape[1] else pairs.new_zeros(len(pairs), pairs.shape[2])
     members = segment_sum(descriptors.members, descriptors.offsets, descriptors.weights)
     return torch.cat([descriptors.cells[:, :-1], members, near], dim=1)
-
-
-def _visible_share(sizes: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
-    """Return 1 for cells of sizes in pixels that training scenes have, and 0 for far smaller ones.
-
-    Such cells would not be seen from where the size of a pixel is measured, so people look at them
-    from nearby, and their size there is unknown.
-    """
-    return (sizes / PIXEL_SCALE - (LEAST_PIXELS - 1)).clamp(0, 1)
 
 
 class KnownRange(nn.Module):

@@ -11,7 +11,6 @@ from itertools import product
 from pathlib import Path
 from typing import Literal, get_args
 
-import pydantic
 import torch
 from torch import Tensor
 
@@ -19,12 +18,13 @@ import cvtgs
 from cvtgs.boxes import Box
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
+from cvtgs.config.base import Record
 from cvtgs.errors import CvtgsError, OutputError, reason_of
 from cvtgs.io.atomic import write_atomically
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors, save_tensors
-from cvtgs.mergenet import Checkpoint, Net, encode_checkpoint, load_checkpoint
+from cvtgs.mergenet import Checkpoint, Net, load_checkpoint
 from cvtgs.outofcore.memory import CELL_ROOM
 from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, write_scan
 
@@ -49,10 +49,8 @@ Step = Literal[
 """First word of the name of a tensor file, which one step writes and later ones read."""
 
 
-class Manifest(pydantic.BaseModel):
+class Manifest(Record):
     """Record written once all rows are sorted into blocks; from then on the job can be resumed."""
-
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
     key: str  # digest of everything that the result depends on
     grouped: int  # Gaussians that the filter leaves to group
@@ -196,11 +194,6 @@ class Job:
             return None
         return load_checkpoint(self.path("network.safetensors")).net.to(dtype)
 
-    def write_network(self, checkpoint: Checkpoint) -> None:
-        """Write the checkpoint to the folder of the job."""
-        content = encode_checkpoint(checkpoint.net, checkpoint.info)
-        self.write_file("network.safetensors", content)
-
     def read_scan(self) -> SceneScan:
         """Read the data of the whole scene that all blocks need."""
         return read_scan(self.path("scan.safetensors"))
@@ -270,13 +263,14 @@ class Job:
                 f"found: {reason}."
             ) from error
 
+    def remove(self) -> None:
+        """Remove the folder of a finished job; if interrupted, nothing is left to continue with."""
+        self.path("sorted.json").unlink(missing_ok=True)
+        shutil.rmtree(Path(self.folder).parent, ignore_errors=True)
+
     def read_manifest(self) -> Manifest:
         """Read the manifest."""
         return Manifest.model_validate_json(self.path("manifest.json").read_bytes())
-
-    def write_manifest(self, manifest: Manifest) -> None:
-        """Write the manifest, which marks all rows as sorted."""
-        self.write_file("manifest.json", manifest.model_dump_json(indent=2).encode())
 
     def _is_whole(self, name: str, size: int, checksum: int) -> bool:
         """Return whether a file of rows still has its original size and checksum."""

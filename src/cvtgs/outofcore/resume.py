@@ -8,20 +8,17 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-import pydantic
-
 from cvtgs.clock import StageClock
+from cvtgs.config.base import Record
 from cvtgs.errors import InputError, OutputError
 from cvtgs.io.locks import hidden_path, lock_path, output_lock
-from cvtgs.mergenet import Checkpoint
+from cvtgs.mergenet import Checkpoint, encode_checkpoint
 from cvtgs.outofcore.job import Job
 from cvtgs.processes import Workers
 
 
-class JobSizes(pydantic.BaseModel):
+class JobSizes(Record):
     """The sizes of a job that its memory decides."""
-
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
     blocks: int
     sample_rows: int
@@ -48,7 +45,8 @@ def started(
             with clock.stage("workers"):
                 check(job)
         if checkpoint is not None:  # a resumed job may find it damaged
-            job.write_network(checkpoint)
+            content = encode_checkpoint(checkpoint.net, checkpoint.info)
+            job.write_file("network.safetensors", content)
         yield
         if not resumes and _stamp(job.source.path) != before:
             raise InputError(

@@ -2,7 +2,6 @@
 
 import math
 import os
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,7 +17,7 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.counts import checked_whole, shared_out, shortfall, target_count, whole_number
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
 from cvtgs.edit import concatenate
-from cvtgs.errors import ConfigError, DroppedDataWarning, check_path, warn
+from cvtgs.errors import ConfigError, check_path
 from cvtgs.evaluation.compare import check_seen
 from cvtgs.grouping import finer_count, most_cells
 from cvtgs.io import atomic_output, check_save, load, save
@@ -54,6 +53,7 @@ from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport, origin_of_views
 from cvtgs.scene import GaussianScene
 from cvtgs.simplifier import Simplifier
+from cvtgs.validity import warn_of_dropped
 from cvtgs.views import find_own_cameras
 
 RANGE_ROWS, MOST_RANGES = 1 << 18, 64
@@ -185,7 +185,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         with started(job, workers, clock, simplifier.checkpoint, resumes=resumes):
             if not resumes:
                 with one_thread():
-                    job.write_manifest(_scan_and_sort(job, key, workers, clock))
+                    manifest = _scan_and_sort(job, key, workers, clock)
+                job.write_file("manifest.json", manifest.to_json().encode())
         energies = _group(job, workers, clock) if job.goes_by_steps else ()
         resumed, is_complete = _run_blocks(job, workers, clock), False
         try:
@@ -195,7 +196,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
             return report_blocks(job, simplifier, clock, energies=energies, resumed=resumed)
         finally:
             if is_complete:  # also if the listener raises at the last event
-                shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
+                job.remove()
 
 
 def rows_per_range(count: int) -> int:
@@ -350,12 +351,7 @@ def report_blocks(
     refinements = [report.refinement for report in reports if report.refinement is not None]
     total, valid = job.source.count, scan.row_count + scan.kept_count
     if valid < total:
-        reasons = ", ".join(f"{name} {number:,}" for name, number in scan.invalid_rows.items())
-        warn(
-            f"dropped {total - valid:,} of {total:,} Gaussians with NaN, infinite or zero values "
-            f"({reasons}).",
-            DroppedDataWarning,
-        )
+        warn_of_dropped(total - valid, total, scan.invalid_rows)
     tessellated = job.blocks_with_rows() if job.goes_by_steps else []
     parts = [job.read("parts", block) for block in tessellated]
     kept_mass = sum(float(job.source.scene(rows).masses.sum()) for rows in kept_rows(job))

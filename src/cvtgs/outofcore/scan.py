@@ -282,7 +282,7 @@ def scan_scene(
     mean_weight = float(weights.mean()) or 1.0
     weights = weights.clamp_min(mean_weight * config.cvt.weight_floor)
     cell_weight = _cell_weight(weights, cell_count / rows_per_sample)
-    shares = (weights / cell_weight).clamp_max(1.0) if cell_weight > 0 else torch.ones_like(weights)
+    shares = in_cells(weights, cell_weight)
     measure = 0.5 / len(shares) + 0.5 * shares / shares.sum()
     return SceneScan(
         frame=frame,
@@ -319,6 +319,11 @@ def _max_flyaway_mass(totals: RangeTotals, max_share: float) -> float:
     max_share *= len(ascending) <= filters.most_flyaways(totals.valid_count)
     left_out = ascending[ascending.cumsum(0) <= max_share * totals.falloff_mass]
     return float(left_out[-1]) if max_share > 0 and len(left_out) else -1.0
+
+
+def in_cells(weights: Float[Tensor, "n"], cell_weight: float) -> Float[Tensor, "n"]:
+    """Return how many cells each Gaussian needs, at most one; heavier ones than a cell need one."""
+    return (weights / cell_weight).clamp_max(1.0) if cell_weight > 0 else torch.ones_like(weights)
 
 
 def _cell_weight(weights: Float[Tensor, "n"], cells: float) -> float:

@@ -31,6 +31,7 @@ from cvtgs.outofcore.scan import (
     RowRange,
     SceneScan,
     add_totals,
+    in_cells,
     read_sample,
     scan_range,
     scan_scene,
@@ -197,8 +198,7 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
             left_out.append(float(masses[free].sum() - masses[chosen].sum()))
         weights = cvt.gaussian_weights(scene.opacities[chosen], areas, area_power=config.area_power)
         weights = weights.clamp_min(scan.mean_weight * config.weight_floor)
-        per_cell = scan.cell_weight
-        cells = (weights / per_cell).clamp_max(1.0) if per_cell > 0 else torch.ones_like(weights)
+        cells = in_cells(weights, scan.cell_weight)
         blocks = scan.partition.blocks_of(scan.frame.contract(scene.means[chosen]))
         added = torch.bincount(blocks, minlength=job.blocks)
         row_counts += added

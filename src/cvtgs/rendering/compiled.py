@@ -39,6 +39,8 @@ F = TypeVar("F", bound=Callable[..., object])
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+_TURN = threading.Lock()  # of threads of the program, where numba takes one loop at a time
+
 prange = numba.prange
 """A range whose steps run in parallel in functions compiled by :func:`parallel`."""
 
@@ -58,16 +60,10 @@ def parallel(function: F) -> F:
 
     @wraps(function)
     def call(*arguments: Any) -> object:
-        with nullcontext() if _takes_several_loops() else _Turn.lock, threads_of_torch():
+        with nullcontext() if _takes_several_loops() else _TURN, threads_of_torch():
             return compiled(*arguments)
 
     return cast("F", call)
-
-
-class _Turn:
-    """The turn of a thread where numba takes one loop at a time."""
-
-    lock = threading.Lock()
 
 
 def _takes_several_loops() -> bool:

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,7 +17,7 @@ from cvtgs.checks import checked
 from cvtgs.clock import StageClock
 from cvtgs.counts import checked_whole, shared_out, target_count, written_ratios
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
-from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, check_path, warn
+from cvtgs.errors import InvalidArgumentError, check_path
 from cvtgs.grouping import finer_count
 from cvtgs.io import change_axes
 from cvtgs.io.atomic import make_folder
@@ -57,7 +56,7 @@ from cvtgs.streams.plan import CHUNK_GAUSSIANS, check_environment, near_rows, pl
 from cvtgs.streams.sog import SogFormat
 from cvtgs.streams.tiles import TilesFormat, check_no_environment, check_transform
 from cvtgs.text import counted, shown
-from cvtgs.validity import with_finite_opacities
+from cvtgs.validity import warn_of_dropped, with_finite_opacities
 
 __all__ = ["StreamReport", "stream_file"]
 
@@ -274,7 +273,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
         write_index(form, parts, spec.folder)
         warn_of_losses(parts, Path(folder))
         publish(spec.folder, Path(folder), kind, overwrite=overwrite)
-        shutil.rmtree(Path(spec.job.folder).parent, ignore_errors=True)
+        spec.job.remove()
     chunks = sum(part.chunks for part in parts)
     return StreamReport(join_levels(parts), chunks, len(parts), resumed)
 
@@ -340,11 +339,8 @@ def _write_targets(
     """Divide every level among the blocks by weight; blocks with rows get at least one Gaussian."""
     total = sum(rows)
     if total < spec.job.source.count:
-        warn(
-            f"dropped {spec.job.source.count - total:,} of {spec.job.source.count:,} Gaussians "
-            "with NaN, infinite or zero values.",
-            DroppedDataWarning,
-        )
+        scan = spec.job.read_scan()
+        warn_of_dropped(spec.job.source.count - total, spec.job.source.count, scan.invalid_rows)
     rooms, levels = list(rows), []
     for target in targets:
         least = sum(1 for room in rooms if room)

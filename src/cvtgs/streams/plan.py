@@ -21,6 +21,7 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.arrays import morton_rows
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import rotation_matrices
+from cvtgs.report import check_one_scene
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
 
@@ -165,11 +166,7 @@ def plan_stream(
             raise InvalidArgumentError(
                 f"levels must be those that Simplifier.levels returns, found {shown(level)}."
             )
-    sizes = sorted({len(_assignment(level)) for level in levels})
-    if len(sizes) > 1:
-        raise InvalidArgumentError(
-            f"levels must be of one scene, found scenes of {sizes[0]:,} and {sizes[1]:,} Gaussians."
-        )
+    check_one_scene(len(_assignment(level)) for level in levels)
     ordered = tuple(sorted(levels, key=lambda level: -len(level.scene)))
     counts = [len(level.scene) for level in ordered]
     if not counts or len(set(counts)) < len(counts):

@@ -10,8 +10,7 @@ from typing import NamedTuple
 from cvtgs.counts import written
 from cvtgs.errors import MissingDependencyError
 from cvtgs.evaluation.comparison_files import PAGE, comparison_page, render_template
-from cvtgs.io import check_output
-from cvtgs.io.atomic import make_folder, write_atomically
+from cvtgs.io.atomic import check_outputs, write_atomically
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.text import counted, size_text
@@ -76,9 +75,7 @@ def check_tradeoff_files(
     folder: str | os.PathLike[str], *, more: tuple[str, ...] = (), overwrite: bool = False
 ) -> None:
     """Make the folder and check that the files can be written, before the work starts."""
-    make_folder(folder)
-    for name in (CSV, JSON, PLOT, PAGE, *more):
-        check_output(Path(folder) / name, overwrite=overwrite)
+    check_outputs(folder, (CSV, JSON, PLOT, PAGE, *more), overwrite=overwrite)
 
 
 def write_tradeoff(

@@ -23,7 +23,6 @@ from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import InvalidArgumentError, RunError, warn
 from cvtgs.evaluation import Comparison, EvaluationSettings, compare
 from cvtgs.evaluation.compare import check_scores
-from cvtgs.evaluation.scorer import mean_of
 from cvtgs.io import load, load_cameras, scene_file, scene_size
 from cvtgs.io.atomic import make_folder
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
@@ -283,12 +282,8 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
             bytes=sizes[run.task.name],
             seconds=run.cost.wall_seconds,
             peak_memory_bytes=run.cost.peak_memory_bytes,
-            psnr=scores.psnr.mean,
-            ssim=scores.ssim.mean,
-            lpips=mean_of(scores.lpips),
-            alpha_error=mean_of(scores.alpha_error),
-            alpha_bias=mean_of(scores.alpha_bias),
             report=run.report,
+            **scores.means(),
         )
         for run, scores in zip(runs, comparison.evaluation.scenes, strict=True)
     ]
