@@ -204,7 +204,6 @@ STAGES = {
         "Choice",
         "CostModel",
         "Found",
-        "Tried",
         "Work",
         "choose_preset",
         "cost_model",

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from functools import partial
 from pkgutil import resolve_name
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import pydantic
 from jaxtyping import Int
@@ -70,6 +70,46 @@ class MatchReport(Record):
     backend: str
 
 
+class Tried(Record):
+    """A count that a search tried, and its scores over the held-out views.
+
+    Attributes:
+        count: Number of Gaussians.
+        psnr: Mean PSNR, dB, at most 60 each.
+        ssim: Mean SSIM.
+        alpha_error: Mean absolute difference of accumulated alpha.
+        alpha_bias: Mean signed difference; negative if more of the background shows through.
+    """
+
+    count: int
+    psnr: float
+    ssim: float
+    alpha_error: float
+    alpha_bias: float
+
+
+class SearchReport(Record):
+    """Report of a search for the smallest count that reaches a quality.
+
+    Attributes:
+        metric: Score to reach, PSNR or SSIM.
+        target: Its value.
+        psnr: Mean PSNR of the result over the held-out views, dB, at most 60 each.
+        ssim: Mean SSIM of the result.
+        alpha_error: Mean absolute difference of accumulated alpha.
+        alpha_bias: Mean signed difference; negative if more of the background shows through.
+        tried: All counts that were tried, in order.
+    """
+
+    metric: Literal["psnr", "ssim"]
+    target: float
+    psnr: float
+    ssim: float
+    alpha_error: float
+    alpha_bias: float
+    tried: tuple[Tried, ...]
+
+
 class CellStatistics(Record):
     """Statistics of the filter and of the cells.
 
@@ -126,6 +166,7 @@ class SimplifyReport(CellStatistics):
         stages: Cost of each stage.
         matching: Report of the matching to images; None if there was none.
         refinement: Report of the refinement; None if there was none.
+        search: Report of the search for the count; None if it was given.
         config: The configuration.
         version: Version of cvtgs that made the result.
     """
@@ -150,6 +191,7 @@ class SimplifyReport(CellStatistics):
     stages: tuple[StageCost, ...] = ()
     matching: MatchReport | None = None
     refinement: RefineReport | None = None
+    search: SearchReport | None = None
     config: SimplifyConfig
     version: str = pydantic.Field(default_factory=partial(resolve_name, "cvtgs:__version__"))
 

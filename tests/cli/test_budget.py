@@ -19,6 +19,7 @@ from cvtgs.cli.goals import STARTED, check_goals, choose_preset, search_target
 from cvtgs.cli.main import build_parser, main
 from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.progress import silent
+from cvtgs.report import SimplifyReport
 from cvtgs.text import counted
 
 MODEL = CostModel(rates={"check": {"in": 1e-6}, "refine": {"look_pixels": 2.5e-7}})
@@ -202,7 +203,13 @@ def test_a_budget_shorter_than_start_up_is_refused(scene, monkeypatch):
 
 @pytest.mark.slow
 def test_a_target_is_searched_and_reported(source, capsys, shown):
-    small = simplified(source, "--target-psnr", "15")
+    report = source.with_name("report.json")
+    small = simplified(source, "--target-psnr", "15", "--report", str(report))
+    search = SimplifyReport.model_validate_json(report.read_bytes()).search
+    assert search is not None
+    assert (search.metric, search.target) == ("psnr", 15)
+    assert search.psnr >= 15
+    assert len(small) in [one.count for one in search.tried]
     lines = capsys.readouterr().out.splitlines()
     text = " ".join(" ".join(lines).split())
     assert f"300 -> {counted(len(small), 'Gaussian')}, " in text

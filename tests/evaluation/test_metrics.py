@@ -247,7 +247,8 @@ def test_a_scene_nearer_than_the_near_plane_is_not_seen() -> None:
     scene = scene.with_tensors(means=scene.means * 1e-4 + torch.tensor([0.0, 0.0, 0.005]))
     intrinsics = torch.tensor([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]])
     camera = Cameras(viewmats=torch.eye(4)[None], Ks=intrinsics, width=16, height=16)
-    with pytest.raises(InvalidArgumentError, match="the cameras must see it, found nothing"):
+    text = "the cameras must see it, found nothing"
+    with pytest.warns(match="lack 100%"), pytest.raises(InvalidArgumentError, match=text):
         check_seen(scene, camera, name="it")
 
 

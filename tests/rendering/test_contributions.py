@@ -1,5 +1,8 @@
 """Contributions and blending weights: sums over images, and how presets use them."""
 
+import re
+import warnings
+
 import pytest
 import torch
 
@@ -9,14 +12,17 @@ from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.analysis import analyze
 from cvtgs.analysis.analyze import measure_contributions
 from cvtgs.cameras import Cameras, look_at
+from cvtgs.edit import Motion, move
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.evaluation.compare import check_seen
 from cvtgs.rendering import blending_weights, contributions, error_shares, observe, render
-from cvtgs.views import automatic_views
+from cvtgs.synthetic import demo_scene
+from cvtgs.views import automatic_views, mixed_views
 from render_cases import around, backends, one_camera
 from scenes import random_scene
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba"])
+@backends
 def test_contributions_are_alpha_times_transmittance_over_all_pixels(backend):
     """An image of one Gaussian alone is its alpha; Gaussians in front dim those behind."""
     scene = gaussians(
@@ -43,7 +49,7 @@ def test_wrong_numbers_of_cameras_are_refused():
         blending_weights(scene, cameras)
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba"])
+@backends
 def test_contributions_ignore_colours_and_sum_to_the_alpha_of_images(backend):
     scene = random_scene(50, degree=1, dtype=torch.float64)
     dark = scene.with_tensors({"sh0": scene.sh0 - 100.0}, {})
@@ -54,7 +60,7 @@ def test_contributions_ignore_colours_and_sum_to_the_alpha_of_images(backend):
     assert float(found.sum()) == pytest.approx(float(alpha.sum()), rel=1e-9)
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba"])
+@backends
 def test_shares_of_errors_are_weighted_like_the_colours_of_an_image(backend):
     """Relative to the mean error of each image; a channel below 0, drawn as 0, does not matter."""
     scene = random_scene(50, degree=1, dtype=torch.float64)
@@ -77,7 +83,7 @@ def test_shares_of_errors_are_weighted_like_the_colours_of_an_image(backend):
         error_shares(scene, cameras)
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba"])
+@backends
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
 def test_errors_are_shared_out_in_modes_without_gradients(backend, mode):
     def shares():
@@ -184,6 +190,23 @@ def test_images_that_show_nothing_change_nothing():
     with pytest.warns(UserWarning, match="images of the scene show nothing"):
         measured = measure_contributions(scene, estimated, seeing, cameras=away)
     assert torch.equal(measured.apparent_areas, estimated.apparent_areas)
+
+
+@pytest.mark.parametrize(("scale", "is_hidden"), [(1.0, False), (0.1, False), (3e-3, True)])
+def test_a_scene_too_small_for_the_near_plane_is_warned_about(scale, is_hidden):
+    scene = move(demo_scene(1000, seed=1), Motion(scale=scale))
+    config = SimplifyConfig.compose(settings={"visibility.views": "4", "visibility.size": "32"})
+    analysis = analyze(scene, config)
+    few = mixed_views(scene, 4, size=32)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        measure_contributions(scene, analysis, config)
+        measure_contributions(scene, analysis, config, cameras=few)  # checked elsewhere
+        check_seen(scene, few, name="full")
+    found = [re.sub(r"\d+%", "n%", str(one.message)) for one in caught]
+    text = "lack n% of the Gaussians before their cameras: renderers draw nothing nearer than"
+    wanted = [f"images of {name} {text} 0.01 units; scale it up." for name in ("the scene", "full")]
+    assert found == (wanted if is_hidden else [])
 
 
 @pytest.mark.slow

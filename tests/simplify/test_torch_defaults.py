@@ -13,6 +13,7 @@ from cvtgs.rendering import contributions
 from cvtgs.streams import plan_stream, stream_file, write_sog_stream, write_tiles
 from cvtgs.synthetic import scene as make
 from cvtgs.views import automatic_views, find_view_positions, mixed_views
+from render_cases import backends
 from scenes import same_bits
 
 IMAGES = {
@@ -151,7 +152,7 @@ def test_positions_above_a_floor(setting):
     assert torch.equal(found.eyes, wanted.eyes)
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba"])
+@backends
 @settings
 def test_contributions(scene, setting, backend):
     cameras = automatic_views(scene, 2, width=32, height=32)

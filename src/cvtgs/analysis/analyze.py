@@ -25,6 +25,7 @@ from cvtgs.losses import SSIM_WINDOW
 from cvtgs.math.frames import RobustFrame, group_radius, robust_frame
 from cvtgs.math.parameters import NEAR_PLANE, divide
 from cvtgs.rendering import ObservedViews, contributions, observe
+from cvtgs.rendering.projection import warn_of_near_plane
 from cvtgs.scene import GaussianScene
 from cvtgs.text import short_repr, shown
 from cvtgs.views import mixed_views
@@ -297,6 +298,8 @@ def measure_contributions(
         rendered = contributions(used, views)
     opacities, apparent = analysis.opacities, analysis.apparent_areas
     if float(rendered.sum()) > 0.0:
+        if cameras is None:  # others were checked before
+            warn_of_near_plane(scene, views.singles(), name="the scene")
         share = config.visibility.mass_share
         apparent = measured_areas(apparent, opacities, rendered, share=share)
     else:

@@ -2,13 +2,12 @@
 
 from cvtgs.budget.calibrate import cost_model, shipped_model
 from cvtgs.budget.costs import CostModel, Work
-from cvtgs.budget.count import Choice, Found, Tried, choose_preset, find_count
+from cvtgs.budget.count import Choice, Found, choose_preset, find_count
 
 __all__ = [
     "Choice",
     "CostModel",
     "Found",
-    "Tried",
     "Work",
     "choose_preset",
     "cost_model",

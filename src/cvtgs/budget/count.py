@@ -2,9 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from itertools import islice
-from statistics import fmean
 from typing import Literal, NamedTuple
 
 from cvtgs.budget.calibrate import CANDIDATES, cost_model
@@ -18,7 +16,7 @@ from cvtgs.errors import GoalError, InvalidArgumentError, InvalidSceneError
 from cvtgs.evaluation.compare import check_seen
 from cvtgs.evaluation.scorer import MOST_PSNR, Metrics, Scorer, scene_scores
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.report import Simplified, SimplifyReport
+from cvtgs.report import SearchReport, Simplified, SimplifyReport, Tried
 from cvtgs.scene import GaussianScene, SceneLike
 from cvtgs.simplifier import Simplifier
 from cvtgs.text import shown
@@ -41,31 +39,12 @@ CLOSE = 1.03  # the search ends when a sufficient and an insufficient count are 
 _FIRST_SHARE, _STEP, _SHORTEST = 0.1, 8.0, 0.15
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Tried:
-    """A count that was tried, and its scores over the held-out views.
-
-    Attributes:
-        count: Number of Gaussians.
-        psnr: Mean PSNR, dB, at most 60 each.
-        ssim: Mean SSIM.
-        alpha_error: Mean absolute difference of accumulated alpha.
-        alpha_bias: Mean signed difference; negative if more of the background shows through.
-    """
-
-    count: int
-    psnr: float
-    ssim: float
-    alpha_error: float
-    alpha_bias: float
-
-
 class Found(NamedTuple):
     """The smallest scene that is good enough, and its scores over the held-out views.
 
     Attributes:
         scene: The scene.
-        report: The report of its simplification.
+        report: The report of its simplification, with that of the search.
         psnr: Mean PSNR, dB, at most 60 each.
         ssim: Mean SSIM.
         alpha_error: Mean absolute difference of accumulated alpha.
@@ -211,15 +190,9 @@ def find_count(
             f"{total:,} Gaussians, reaches {reached}."
         )
     (small, report), quality = best
-    return Found(
-        scene=small,
-        report=report,
-        psnr=quality.psnr,
-        ssim=quality.ssim,
-        alpha_error=quality.alpha_error,
-        alpha_bias=quality.alpha_bias,
-        tried=tuple(tried),
-    )
+    facts = {**quality.model_dump(exclude={"count"}), "tried": tuple(tried)}
+    search = SearchReport(metric=target.metric, target=target.value, **facts)
+    return Found(small, report.model_copy(update={"search": search}), **facts)
 
 
 def heldout_scorer(full: GaussianScene, cameras: Cameras, *, listener: ProgressListener) -> Scorer:
@@ -238,15 +211,8 @@ def heldout_scorer(full: GaussianScene, cameras: Cameras, *, listener: ProgressL
 
 def heldout_quality(scorer: Scorer, small: GaussianScene, *, count: int) -> Tried:
     """Score a small scene over the held-out views."""
-    rows = scorer.score(small)
-    scores = scene_scores("", len(small), rows)
-    return Tried(
-        count=count,
-        psnr=scores.psnr.mean,
-        ssim=scores.ssim.mean,
-        alpha_error=fmean(row.alpha_error for row in rows),
-        alpha_bias=fmean(row.alpha_bias for row in rows),
-    )
+    means = scene_scores("", len(small), scorer.score(small)).means()
+    return Tried(count=count, **{name: means[name] for name in means if name != "lpips"})
 
 
 def smallest_enough(

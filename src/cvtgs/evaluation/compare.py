@@ -28,7 +28,7 @@ from cvtgs.evaluation.scorer import (
 from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.rendering import BackendName, choose_backend
-from cvtgs.rendering.projection import to_matrices
+from cvtgs.rendering.projection import to_matrices, warn_of_near_plane
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.text import printable_name, short_repr, shown
 
@@ -267,6 +267,7 @@ def check_seen(
     A sample of a scene cannot tell that a camera sees nothing, so there is no warning.
     """
     to_matrices(cameras)  # alone, each would be "camera 0" in errors
+    warn_of_near_plane(scene, cameras.singles(), name=name)
     is_drawn = scene.opacities >= MIN_ALPHA
     points = scene.means[is_drawn] if bool(is_drawn.any()) else scene.means
     blind = cameras.to("cpu").singles()

@@ -38,6 +38,7 @@ from cvtgs.outofcore.merge import BlockCells, read_cells, read_report, reduce_ro
 from cvtgs.outofcore.rows import BlockRows, kept_rows, read_rows
 from cvtgs.refinement import refine
 from cvtgs.rendering import ObservedViews, contributions, error_shares, observe
+from cvtgs.rendering.projection import warn_of_near_plane
 from cvtgs.report import MatchReport, RefineReport
 from cvtgs.scene import GaussianScene
 from cvtgs.views import CameraPositions, find_view_positions, mixed_views
@@ -66,6 +67,8 @@ def write_views(job: Job, sample: GaussianScene, *, total: int) -> None:
         positions = find_view_positions(sample)
         for name, views in _views_from(positions, job.config, sharp=True).items():
             contents |= add_prefix(name, _packed(views))
+            if name == SEEN:
+                warn_of_near_plane(sample, views.singles(), name="the scene")
     save_tensors(job.views_path, contents, {})
 
 

@@ -19,6 +19,7 @@ from cvtgs.refinement.images import ImageBuffer, generated_views, shared_views, 
 from cvtgs.refinement.optimize import STAGE, Limits, learning_rate_scales, optimize
 from cvtgs.rendering import ObservedViews
 from cvtgs.rendering.backends import choose_backend
+from cvtgs.rendering.projection import warn_of_near_plane
 from cvtgs.rendering.render import check_observed
 from cvtgs.report import RefineReport, SimplifyReport
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
@@ -152,6 +153,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
             views = shared_views(observed, theirs, cameras, config=config, seed=seed)
         elif cameras is None:
             views = generated_views(theirs, config=config, seed=seed)
+            warn_of_near_plane(theirs, views.heldout, name="the full scene")
         else:
             views = split_views(cameras, config=config, seed=seed)
         metrics = Metrics(ssim=False, alpha=False, most_psnr=MOST_PSNR)

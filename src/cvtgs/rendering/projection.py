@@ -1,5 +1,6 @@
 """Project Gaussians onto an image, in differentiable torch operations, by the rules of 3DGS."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import NamedTuple
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.cameras import Cameras, view_scales
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import InvalidArgumentError, warn
 from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.scene import GaussianScene
 
@@ -30,6 +31,13 @@ MIN_TRANSMITTANCE = 1e-4
 SKEW = 1e-3
 """Entries of the product of a rotation and its transpose may differ from the identity by this,
 after a uniform scale of the view is divided out."""
+
+
+SAMPLED = 4096  # about how many Gaussians tell how much the near plane hides
+
+MOST_HIDDEN = 0.01
+"""Mean share of the Gaussians before a camera that the near plane may hide. Among captures and
+generated scenes of 3 to 0.1 radii, it is 0; at 0.01, and of 0.01 radii, PSNR changes by 1 dB."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -309,3 +317,22 @@ def _colors(scene: GaussianScene, rows: Tensor, offsets: Tensor, sh_degree: int)
     directions = torch.nn.functional.normalize(offsets.double(), dim=1).to(offsets.dtype)
     shN = scene.shN[:, :count].index_select(0, rows)  # noqa: N806
     return spherical_harmonics.evaluate(sh0, shN, directions)
+
+
+def warn_of_near_plane(scene: GaussianScene, cameras: Sequence[Cameras], *, name: str) -> None:
+    """Warn if the near plane hides much of a scene from single cameras: its units are too large."""
+    points = scene.means[:: -(-len(scene) // SAMPLED)].double().cpu()
+    shares = []
+    for camera in cameras:
+        view, intrinsics = camera.viewmats[0].to(points), camera.Ks[0].to(points)
+        x, y, depth = intrinsics @ (view[:3, :3] @ points.T + view[:3, 3:])
+        ahead = (depth > 0) & (x >= 0) & (x <= camera.width * depth)
+        ahead &= (y >= 0) & (y <= camera.height * depth)
+        hidden = ahead & (depth < parameters.NEAR_PLANE)
+        shares.append(int(hidden.sum()) / max(1, int(ahead.sum())))
+    share = sum(shares) / len(shares)
+    if share > MOST_HIDDEN:
+        warn(
+            f"images of {name} lack {share:.0%} of the Gaussians before their cameras: renderers "
+            f"draw nothing nearer than {parameters.NEAR_PLANE} units; scale it up."
+        )

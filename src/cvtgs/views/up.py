@@ -94,6 +94,7 @@ def _thinnest_axes(scene: GaussianScene) -> Float[Tensor, "n 3"]:
 
 class _Plane(NamedTuple):
     normal: Tensor
+    height: float
     score: float
 
 
@@ -215,7 +216,7 @@ def _refined(voxels: Voxels, normal: Tensor, height: float) -> _Plane:
     everything = (axes.T @ _scatter(voxels.points) @ axes).diagonal().clamp_min(1e-12).sqrt()
     roundness = float(lengths[1] / lengths[2].clamp_min(1e-6))
     width = float((lengths[1:] / everything[1:]).clamp(max=1).amin())
-    return _Plane(normal, max(support * roundness * width**2, support**2))
+    return _Plane(normal, height, max(support * roundness * width**2, support**2))
 
 
 def _scatter(points: Float[Tensor, "v 3"]) -> Float[Tensor, "3 3"]:
