@@ -19,7 +19,8 @@ TEXTS = {path: path.read_text(encoding="utf-8") for path in FILES}
 # chunks of `devices`, and `report` shows the effect plan of `analysis`, so each stands above the
 # modules it needs; `devices` and `cameras` (data) stand as low as their imports allow.
 LEVELS = [
-    {"errors", "progress", "startup", "tags", "text"},
+    {"startup", "tags", "text"},
+    {"errors", "progress"},
     {"devices", "checks", "counts"},
     {"math", "clock", "plots", "boxes"},
     {"config", "scene", "cameras", "processes"},

@@ -84,6 +84,23 @@ def test_memory_errors_while_loading(
     assert isinstance(caught.value, MemoryError)
 
 
+def test_memory_errors_of_simplification_and_writing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, path = random_scene(50), tmp_path / "a.splat"
+    monkeypatch.setattr("cvtgs.prepared.reduce_scene", without_memory)
+    with pytest.raises(OutOfMemoryError) as caught:
+        cvtgs.Simplifier(device="cpu").simplify(scene, 0.5)
+    assert str(caught.value) == (
+        "simplifying 50 Gaussians needs more memory than is available; free some, or simplify a "
+        "binary .ply block by block: cvtgs simplify IN OUT --memory AMOUNT."
+    )
+    monkeypatch.setattr("cvtgs.io.splat.write_splat", without_memory)
+    with pytest.raises(OutOfMemoryError, match=r"writing .* needs more memory .*; free some"):
+        io.save(random_scene(5, degree=0), path)
+    assert not path.exists()
+
+
 def test_memory_errors_at_the_command_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

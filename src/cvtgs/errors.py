@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, Self
 
+from cvtgs.text import printable_name
+
 __all__ = [
     "CheckpointError",
     "ConfigError",
@@ -41,6 +43,11 @@ _NO_MEMORY = re.compile(
 """Out-of-memory messages of torch, CUDA, the dynamic loader and Python's imports."""
 
 
+BLOCKS_ADVICE = (
+    "free some, or simplify a binary .ply block by block: cvtgs simplify IN OUT --memory AMOUNT"
+)
+"""What to do if a scene needs more memory than there is."""
+
 RENAMINGS: ContextVar[tuple[Callable[[str], str], ...]] = ContextVar("RENAMINGS", default=())
 """What replaces the names of temporary files in warnings, while streams are read."""
 
@@ -49,6 +56,9 @@ _LEFT_OUT: ContextVar[tuple[type[Warning], ...]] = ContextVar("_LEFT_OUT", defau
 
 class CvtgsError(Exception):
     """Base of every error that cvtgs raises on purpose; its text is one clear sentence."""
+
+    def __str__(self) -> str:  # names of files may hold any character
+        return printable_name(Exception.__str__(self))
 
 
 class InvalidArgumentError(CvtgsError, ValueError):
@@ -69,9 +79,6 @@ class FileFormatError(CvtgsError, ValueError):
 
 class _FileError(CvtgsError, OSError):
     """Base of errors about a file; ``filename`` and ``errno`` are set if they are known."""
-
-    def __str__(self) -> str:  # OSError would return number, reason and name instead
-        return Exception.__str__(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _file_error, (type(self), self.args, self.errno, self.filename)
@@ -211,8 +218,9 @@ def memory_errors(work: str, advice: str) -> Iterator[None]:
 
 def check_path(path: object) -> None:
     """Raise unless a value can be the path of a file or folder."""
-    if not isinstance(path, str | os.PathLike):
-        raise InvalidArgumentError(f"a path must be a str or Path, found {type(path).__name__}.")
+    if not isinstance(path, str | os.PathLike) or isinstance(os.fspath(path), bytes):
+        kind = "one of bytes" if isinstance(path, os.PathLike) else type(path).__name__
+        raise InvalidArgumentError(f"a path must be a str or Path, found {kind}.")
     if not os.fspath(path):
         raise InvalidArgumentError("a path must not be empty, found ''.")
 

@@ -24,7 +24,7 @@ from cvtgs.devices import (
     without_spinning,
 )
 from cvtgs.edit import concatenate
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import BLOCKS_ADVICE, InvalidArgumentError, memory_errors
 from cvtgs.grouping import OrderedRows, add_neighbors, importance_by_errors, order_rows
 from cvtgs.mergenet import Checkpoint, Net
 from cvtgs.pipeline import Reduced, level_facts, reduce_scene
@@ -142,18 +142,15 @@ class Prepared:
             self._device_note = note or self._move_note
             return compute()
 
+        work = f"simplifying {self._total:,} Gaussians"
         with (
             threads_for_chunks() if self._config.uses_images else without_spinning(),
             torch.inference_mode(mode=False),
             torch.no_grad(),
             without_autocast(),
+            memory_errors(work, BLOCKS_ADVICE),
         ):
-            return within_memory(
-                compute_on,
-                self._device,
-                work=f"simplifying {self._total:,} Gaussians",
-                may_leave=self._may_leave,
-            )
+            return within_memory(compute_on, self._device, work=work, may_leave=self._may_leave)
 
     def _run(self, target: int, keep: Bool[Tensor, "n"] | None) -> Simplified:
         clock = StageClock(self._listener, self._device)

@@ -4,17 +4,20 @@ import importlib
 import json
 import os
 import shutil
+import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from cvtgs import load, load_cameras, save, to_dict
+from cvtgs import describe, load, load_cameras, save, to_dict
 from cvtgs.boxes import read_boxes
 from cvtgs.cli.main import main
 from cvtgs.errors import (
+    DroppedDataWarning,
     FileFormatError,
     InputError,
     InputNotFoundError,
@@ -273,3 +276,45 @@ def test_names_that_no_file_can_have_are_refused(name: str) -> None:
             read(f"{name}{suffix}")
     with pytest.raises(OutputError, match=r"the output must have a valid name"):
         save(random_scene(2), f"{name}.ply")
+
+
+def test_paths_of_bytes_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").touch()
+    with os.scandir(os.fsencode(tmp_path)) as entries:
+        entry = next(entries)
+    for call in (load, describe, partial(save, random_scene(2))):
+        with pytest.raises(InvalidArgumentError, match="must be a str or Path, found one of bytes"):
+            call(entry)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows keeps the working directory")
+def test_a_deleted_working_directory_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+    with pytest.raises(OutputError, match=r"a\.ply: the output must be writable, found: no such"):
+        save(random_scene(2), "a.ply")
+
+
+def test_names_cannot_add_lines_to_messages(tmp_path: Path) -> None:
+    with pytest.raises(InputNotFoundError) as caught:
+        load(tmp_path / "a\nb\x1b[2J.ply")
+    assert str(caught.value).endswith(
+        r"a\nb\u001b[2J.ply: the file to read must exist, found none."
+    )
+    assert caught.value.filename.endswith("a\nb\x1b[2J.ply")
+
+
+@pytest.mark.parametrize("suffix", ["spz", "splat", "glb", "compressed.ply", "sog", "usda"])
+def test_values_that_a_format_cannot_hold_are_written_without_warnings_of_numpy(
+    tmp_path: Path, suffix: str
+) -> None:
+    scene = random_scene(9, degree=1)
+    large = {"sh0": scene.sh0 * 1e38, "shN": scene.shN * 1e38, "log_scales": scene.log_scales + 80}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        warnings.simplefilter("ignore", DroppedDataWarning)
+        save(scene.with_tensors(large, {}), tmp_path / f"a.{suffix}")

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from cvtgs import load, save
-from cvtgs.errors import FileFormatError, InvalidSceneError
+from cvtgs.errors import DroppedDataWarning, FileFormatError, InvalidSceneError
+from cvtgs.io.files import validated
 from format_cases import refusal, storable_scene
 from gltf_cases import NAME, Change, accessor, changed, joined, parts, primitive, without
 
@@ -179,6 +180,37 @@ def test_nodes_that_repeat_a_mesh_too_often_are_refused(tmp_path: Path) -> None:
     size = changed(path, repeat).stat().st_size
     with pytest.raises(FileFormatError, match=f"in a file of {size:,}; if you trust the file"):
         load(path)
+
+
+@pytest.mark.parametrize("is_splat", [True, False])
+def test_meshes_of_many_primitives_are_not_multiplied_by_nodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_splat: bool
+) -> None:
+    def repeat(document: dict[str, Any]) -> None:
+        extensions = {NAME: {}} if is_splat else {}
+        document["meshes"].append({"primitives": [{"extensions": extensions}] * 500})
+        document["nodes"] = [{"mesh": 1}] * 400 + [{"mesh": 0}]
+        document["scenes"] = [{"nodes": list(range(401))}]
+
+    def counting(model: Any, value: object, where: str) -> Any:
+        nonlocal calls
+        calls += 1
+        return validated(model, value, where)
+
+    path, calls = tmp_path / "a.glb", 0
+    save(storable_scene(3, degree=0), path)
+    size = changed(path, repeat).stat().st_size
+    monkeypatch.setattr("cvtgs.io.gltf.read.validated", counting)
+    if is_splat:
+        assert refusal(path) == (
+            f"{path}: nodes must show at most {1000 + size // 40:,} mesh primitives in a file of "
+            f"{size:,} bytes, found more; if you trust the file, pass trust_sizes=True "
+            f"(--trust-sizes)."
+        )
+    else:
+        with pytest.warns(DroppedDataWarning, match="left out 500 mesh primitives without"):
+            assert len(load(path)) == 3
+    assert calls <= 2 * 501
 
 
 def test_damaged_spz_data_inside_a_glb_is_refused(tmp_path: Path) -> None:

@@ -145,7 +145,10 @@ def rows(document: dict[str, Any], chunk: int = 0, level: str = "0") -> dict[str
     return document["tree"]["children"][chunk]["lods"][level]
 
 
-OUTSIDE = "the files of a stream must be meta.json or .sog in its folder, found "
+OUTSIDE = (
+    "the files of a stream must be meta.json or .sog in its folder, with names of at most 255 "
+    "characters, found "
+)
 DAMAGE: dict[str, tuple[Change, str]] = {
     "version": (lambda d: d.update(version=2), "'version' must be 1, found 2."),
     "levels": (lambda d: d.update(lodLevels=0), "'lodLevels' must be 1 or more, found 0."),
@@ -206,6 +209,10 @@ DAMAGE: dict[str, tuple[Change, str]] = {
     "foreign": (
         lambda d: d["filenames"].__setitem__(0, "0_0/scene.ply"),
         f"{OUTSIDE}'0_0/scene.ply'.",
+    ),
+    "long": (
+        lambda d: d.update(environment="y" * 5000 + ".sog"),
+        f"{OUTSIDE}{shown('y' * 5000)}.",
     ),
     "nothing": (
         lambda d: (d.pop("environment"), d.update(tree={}, counts=[0, 0])),

@@ -248,6 +248,8 @@ def _is_own(temporary: Path, file: BinaryIO) -> bool:
 def _target(path: str | os.PathLike[str]) -> Path:
     try:
         return Path(os.path.realpath(path))
+    except FileNotFoundError as error:  # the working directory was deleted
+        raise write_error(path, error) from error
     except UnicodeEncodeError as error:
         raise OutputError(f"{shown(path)}: the output must have a valid name: {error}.") from error
 

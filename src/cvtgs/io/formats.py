@@ -8,10 +8,12 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, BinaryIO, Literal
 
+import numpy as np
 import torch
 
 from cvtgs.devices import usable_device, without_spinning
 from cvtgs.errors import (
+    BLOCKS_ADVICE,
     DroppedDataWarning,
     FileFormatError,
     InvalidArgumentError,
@@ -44,10 +46,6 @@ _READERS: Mapping[str, str] = {
     ".pt": "cvtgs.io.dicts:read_checkpoint",
 }
 """Readers by suffix, imported when needed; the first suffix that fits counts."""
-
-_ADVICE = (
-    "free some, or simplify a binary .ply block by block: cvtgs simplify IN OUT --memory AMOUNT"
-)
 
 _SIZED = (".compressed.ply", ".splat", ".ksplat")
 """Formats besides plain PLY that store every row, so that ``trust_sizes`` does not apply."""
@@ -172,7 +170,7 @@ def load(
                 f"lod must be given only for a streamed SOG ({_STREAM}), found {lod} for {source}."
             )
         options["lod"] = lod
-    with memory_errors(f"{source}: reading the scene", _ADVICE):
+    with memory_errors(f"{source}: reading the scene", BLOCKS_ADVICE):
         read: Callable[..., GaussianScene] = resolve_name(_READERS[suffix])
         scene = read(source, **options)
         if axes is not None and suffix not in _STATES_AXES:
@@ -236,6 +234,7 @@ def save(
     output: AbstractContextManager[BinaryIO]
     check_scene(scene)
     if isinstance(path, str | os.PathLike):
+        check_path(path)
         name, named = os.fspath(path), _dotted(format) or path
         output = atomic_output(path, overwrite=overwrite)
     else:
@@ -258,7 +257,8 @@ def save(
         warn(f"{name}: files of this format do not hold {'; '.join(dropped)}.", DroppedDataWarning)
     options = {"version": spz_version, "axes": axes} if suffix == ".spz" else {}
     write: Callable[..., None] = resolve_name(_WRITERS[suffix])
-    with output as file:
+    # Values that a format cannot hold are clamped; numpy would warn of their overflow.
+    with np.errstate(over="ignore"), memory_errors(f"writing {name}", "free some"), output as file:
         write(scene, file, **options)
 
 

@@ -1,5 +1,6 @@
 """Read the Gaussians of all nodes of a glTF scene, transformed by their nodes."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -53,6 +54,9 @@ from cvtgs.text import counted, printable, shown
 
 _KNOWN = (SPLATS, SPZ, QUANTIZATION)
 _POINTS = 0
+MOST_PLACED, NODE_BYTES = 1000, 40
+"""A file may show this many primitives, and one more for so many bytes, fewer than a node takes."""
+
 _EVENNESS = 1e-4  # tolerance for the scale of a node to count as uniform, relative to it
 
 Matrix = Float[np.ndarray, "4 4"]
@@ -99,13 +103,12 @@ class _Compression(Document):
     bufferView: Size  # noqa: N815
 
 
-class _Placed(NamedTuple):
-    """A primitive of splats with its extension, its place in errors and its node's matrix."""
+class _Splats(NamedTuple):
+    """A primitive of splats with its extension and its place in errors."""
 
     primitive: _Primitive
     splatting: _Splatting
     where: str
-    matrix: Matrix
 
 
 def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False) -> GaussianScene:
@@ -116,34 +119,49 @@ def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False)
         raise file.error(
             f"must require no extensions other than {', '.join(_KNOWN)}, found {shown(strange[0])}"
         )
-    placed = list(_splats(file))
+    placed = _splats(file, math.inf if trust_sizes else file.stored // NODE_BYTES + MOST_PLACED)
     if not placed:
         raise file.error(f"must have a mesh primitive with {SPLATS}, found none")
+    splats = {id(one): one for one, _ in placed}  # without those of nodes that repeat a mesh
     if not trust_sizes:
-        _check_sizes(file, placed)
-    scenes = []
-    for one in placed:  # a comprehension adds a stack level in Python 3.11 only
-        scenes.append(_read_primitive(file, one, trust_sizes=trust_sizes))
+        _check_sizes(file, splats, [id(one) for one, _ in placed])
+    read, scenes = dict[int, GaussianScene](), []
+    for key, one in splats.items():  # a comprehension adds a stack level in Python 3.11 only
+        read[key] = _read_primitive(file, one, trust_sizes=trust_sizes)
+    for one, matrix in placed:
+        scenes.append(_moved(file, read[id(one)], matrix))
     scene = scenes[0] if len(scenes) == 1 else merge(scenes)
     return change_axes(scene, AXES if axes is None else axes, SCENE_AXES)
 
 
-def _splats(file: GltfFile) -> Iterator[_Placed]:
-    """Yield the splat primitives of all nodes of the scene; warn about other primitives."""
-    others = 0
+def _splats(file: GltfFile, most: float) -> list[tuple[_Splats, Matrix]]:
+    """Return the splats of all nodes with their matrices; warn about other primitives."""
+    meshes, placed, others = dict[int, list[_Splats]](), list[tuple[_Splats, Matrix]](), 0
     for index, matrix in _placed_meshes(file):
-        mesh = file.entry(_Mesh, "meshes", index)
-        for number, value in enumerate(mesh.primitives):
-            where = f"{file.path}: meshes[{index}].primitives[{number}]"
-            primitive = validated(_Primitive, value, where)
-            if SPLATS not in primitive.extensions:
-                others += 1
-                continue
-            splatting = validated(_Splatting, primitive.extensions[SPLATS], f"{where}: {SPLATS!r}")
-            yield _Placed(primitive, splatting, where, matrix)
+        if index not in meshes:
+            primitives = file.entry(_Mesh, "meshes", index).primitives
+            meshes[index] = list(_splats_of(file, index, primitives))
+            others += len(primitives) - len(meshes[index])
+        placed += [(one, matrix) for one in meshes[index]]
+        if len(placed) > most:
+            raise file.error(
+                f"nodes must show at most {most:,} mesh primitives in a file of {file.stored:,} "
+                f"bytes, found more; if you trust the file, pass trust_sizes=True (--trust-sizes)"
+            )
     if others:
         left_out = counted(others, "mesh primitive")
         warn(f"{file.path}: left out {left_out} without Gaussians.", DroppedDataWarning)
+    return placed
+
+
+def _splats_of(file: GltfFile, index: int, primitives: list[Any]) -> Iterator[_Splats]:
+    """Yield the primitives of a mesh that are splats."""
+    for number, value in enumerate(primitives):
+        where = f"{file.path}: meshes[{index}].primitives[{number}]"
+        primitive = validated(_Primitive, value, where)
+        if SPLATS in primitive.extensions:
+            splatting = validated(_Splatting, primitive.extensions[SPLATS], f"{where}: {SPLATS!r}")
+            yield _Splats(primitive, splatting, where)
 
 
 def _placed_meshes(file: GltfFile) -> Iterator[tuple[int, Matrix]]:
@@ -177,13 +195,17 @@ def _local_matrix(node: _Node) -> Matrix:
     return matrix
 
 
-def _check_sizes(file: GltfFile, placed: list[_Placed]) -> None:
+def _check_sizes(file: GltfFile, splats: dict[int, _Splats], placed: list[int]) -> None:
     """Refuse nodes that repeat the same bytes too often."""
-    counts, degrees = zip(*(_size(file, one) for one in placed), strict=True)
-    check_expansion(file.path, count=sum(counts), sh_degree=max(degrees), stored=file.stored)
+    sizes = {key: _size(file, one) for key, one in splats.items()}
+    count, degree = (
+        sum(sizes[key][0] for key in placed),
+        max(degree for _, degree in sizes.values()),
+    )
+    check_expansion(file.path, count=count, sh_degree=degree, stored=file.stored)
 
 
-def _size(file: GltfFile, one: _Placed) -> tuple[int, int]:
+def _size(file: GltfFile, one: _Splats) -> tuple[int, int]:
     """Return the number of Gaussians of a primitive, and their SH degree."""
     packed = _packed(file, one)
     if packed is not None:
@@ -193,7 +215,7 @@ def _size(file: GltfFile, one: _Placed) -> tuple[int, int]:
     return position.count, _degree(file, one)
 
 
-def _packed(file: GltfFile, one: _Placed) -> tuple[bytes, str] | None:
+def _packed(file: GltfFile, one: _Splats) -> tuple[bytes, str] | None:
     """Return the SPZ inside a primitive, and its name for errors; None if it has attributes."""
     if SPZ not in one.splatting.extensions:
         return None
@@ -203,7 +225,7 @@ def _packed(file: GltfFile, one: _Placed) -> tuple[bytes, str] | None:
     return bytes(content), f"{file.path}: bufferViews[{index}]"
 
 
-def _read_primitive(file: GltfFile, one: _Placed, *, trust_sizes: bool) -> GaussianScene:
+def _read_primitive(file: GltfFile, one: _Splats, *, trust_sizes: bool) -> GaussianScene:
     primitive, splatting = one.primitive, one.splatting
     if primitive.mode != _POINTS or splatting.kernel != KERNEL:
         raise file.error(
@@ -221,10 +243,10 @@ def _read_primitive(file: GltfFile, one: _Placed, *, trust_sizes: bool) -> Gauss
         scene = _read_attributes(file, one)
     else:
         scene = decode_spz(*packed, axes=SCENE_AXES, trust_sizes=trust_sizes)
-    return _moved(file, _with_comments(scene, primitive.extras), one)
+    return _with_comments(scene, primitive.extras)
 
 
-def _read_attributes(file: GltfFile, one: _Placed) -> GaussianScene:
+def _read_attributes(file: GltfFile, one: _Splats) -> GaussianScene:
     means = file.values(_index(file, one, POSITION), "VEC3", POSITION)
 
     def rows(name: str, kind: str) -> Float[np.ndarray, "n k"]:
@@ -259,13 +281,13 @@ def _read_attributes(file: GltfFile, one: _Placed) -> GaussianScene:
     )
 
 
-def _index(file: GltfFile, one: _Placed, name: str) -> int:
+def _index(file: GltfFile, one: _Splats, name: str) -> int:
     if name not in one.primitive.attributes:
         raise file.error(f"Gaussians must have an accessor for {name}, found none")
     return one.primitive.attributes[name]
 
 
-def _degree(file: GltfFile, one: _Placed) -> int:
+def _degree(file: GltfFile, one: _Splats) -> int:
     """Return the SH degree; check that all coefficients up to this degree are present."""
     names = one.primitive.attributes
     degree = 0
@@ -295,9 +317,8 @@ def _with_comments(scene: GaussianScene, extras: Any) -> GaussianScene:
     return replace(scene, comments=(*own, *comments))
 
 
-def _moved(file: GltfFile, scene: GaussianScene, one: _Placed) -> GaussianScene:
+def _moved(file: GltfFile, scene: GaussianScene, matrix: Matrix) -> GaussianScene:
     """Transform Gaussians by the matrix of their node."""
-    matrix = one.matrix
     if np.array_equal(matrix, np.eye(4)):
         return scene
     with np.errstate(all="ignore"):

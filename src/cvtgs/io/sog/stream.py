@@ -12,6 +12,7 @@ from cvtgs.counts import whole_number
 from cvtgs.edit import merge
 from cvtgs.errors import FileFormatError, InvalidArgumentError
 from cvtgs.io.files import (
+    LONGEST_NAME,
     Document,
     Items,
     Size,
@@ -161,10 +162,11 @@ def _check_count(
 def _inside(path: Path, name: str) -> Path:
     """Return the path of a SOG of the stream, which must be in its folder."""
     pure = PurePosixPath(name)
-    if not is_within(name) or (pure.name != META and pure.suffix != ".sog"):
+    is_sog = pure.name == META or pure.suffix == ".sog"
+    if not is_sog or not is_within(name) or len(name) > LONGEST_NAME:
         raise FileFormatError(
-            f"{path}: the files of a stream must be {META} or .sog in its folder, found "
-            f"{shown(name)}."
+            f"{path}: the files of a stream must be {META} or .sog in its folder, with names of at "
+            f"most {LONGEST_NAME} characters, found {shown(name)}."
         )
     return path.parent / pure
 
