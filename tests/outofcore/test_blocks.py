@@ -24,6 +24,7 @@ from cvtgs.outofcore.scan import (
     RangeTotals,
     RowRange,
     add_totals,
+    in_cells,
     partition_space,
     scan_range,
     scan_scene,
@@ -42,6 +43,12 @@ def source(scene, tmp_path_factory):
     path = tmp_path_factory.mktemp("blocks") / "in.ply"
     cvtgs.save(scene, path)
     return path
+
+
+def test_heavy_gaussians_need_one_cell_and_light_ones_a_share():
+    weights = torch.tensor([0.5, 2.0, 8.0])
+    assert in_cells(weights, 2.0).tolist() == [0.25, 1.0, 1.0]
+    assert in_cells(weights, 0.0).tolist() == [1.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Blocks are matched and refined while the others are rendered but fixed: no seams, same bits."""
 
+import warnings
 from typing import Any
 
 import pytest
@@ -9,6 +10,7 @@ import cvtgs
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.boxes import Box
 from cvtgs.clock import StageCost
+from cvtgs.edit import Motion, move
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.outofcore import LocalWorkers, images as module, simplify_file
@@ -52,6 +54,16 @@ def in_blocks(source, output, settings, *, count=COUNT, blocks=3, **options):
     return simplify_file(
         source, output, count=count, blocks=blocks, simplifier=simplifier, **options
     )
+
+
+def test_a_scene_too_small_for_the_near_plane_is_warned_about_once(scene, tmp_path):
+    cvtgs.save(move(scene, Motion(scale=3e-3)), tmp_path / "in.ply")
+    settings = MATCHED | {"visibility": {"views": 4, "size": 32}}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        in_blocks(tmp_path / "in.ply", tmp_path / "out.ply", settings)
+    texts = [str(one.message) for one in caught]
+    assert sum("of the Gaussians before their cameras" in text for text in texts) == 1
 
 
 def psnr_of(scene, small):

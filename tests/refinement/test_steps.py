@@ -6,11 +6,20 @@ import pytest
 import torch
 
 from cvtgs.config import RefineConfig
+from cvtgs.edit import Motion, move
 from cvtgs.evaluation.scorer import render_views
 from cvtgs.refinement import refine
 from cvtgs.refinement.images import ImageBuffer, RefineViews
 from cvtgs.refinement.optimize import mean_loss
 from refine_cases import discolored, full_scene, quick, ring, small_scene, three_views
+
+
+def test_a_scene_too_small_for_the_near_plane_is_warned_about():
+    full, small = (
+        move(one, Motion(scale=2e-3)) for one in (full_scene(), small_scene(full_scene()))
+    )
+    with pytest.warns(match="images of the full scene lack .* scale it up"):
+        refine(small, full, steps=1, config=quick())
 
 
 def test_the_images_of_a_step_are_joined_by_their_size():

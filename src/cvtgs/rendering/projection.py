@@ -326,8 +326,8 @@ def warn_of_near_plane(scene: GaussianScene, cameras: Sequence[Cameras], *, name
     for camera in cameras:
         view, intrinsics = camera.viewmats[0].to(points), camera.Ks[0].to(points)
         x, y, depth = intrinsics @ (view[:3, :3] @ points.T + view[:3, 3:])
-        ahead = (depth > 0) & (x >= 0) & (x <= camera.width * depth)
-        ahead &= (y >= 0) & (y <= camera.height * depth)
+        # Behind the camera, no number is between 0 and a negative one.
+        ahead = (x >= 0) & (x <= camera.width * depth) & (y >= 0) & (y <= camera.height * depth)
         hidden = ahead & (depth < parameters.NEAR_PLANE)
         shares.append(int(hidden.sum()) / max(1, int(ahead.sum())))
     share = sum(shares) / len(shares)
