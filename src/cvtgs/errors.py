@@ -57,7 +57,7 @@ _LEFT_OUT: ContextVar[tuple[type[Warning], ...]] = ContextVar("_LEFT_OUT", defau
 class CvtgsError(Exception):
     """Base of every error that cvtgs raises on purpose; its text is one clear sentence."""
 
-    def __str__(self) -> str:  # names of files may hold any character
+    def __str__(self) -> str:  # names of files hold any character; OSError would add numbers
         return printable_name(Exception.__str__(self))
 
 

@@ -122,14 +122,14 @@ def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False)
     placed = _splats(file, math.inf if trust_sizes else file.stored // NODE_BYTES + MOST_PLACED)
     if not placed:
         raise file.error(f"must have a mesh primitive with {SPLATS}, found none")
-    splats = {id(one): one for one, _ in placed}  # without those of nodes that repeat a mesh
+    splats = {one.where: one for one, _ in placed}  # each once, though nodes may repeat its mesh
     if not trust_sizes:
-        _check_sizes(file, splats, [id(one) for one, _ in placed])
-    read, scenes = dict[int, GaussianScene](), []
-    for key, one in splats.items():  # a comprehension adds a stack level in Python 3.11 only
-        read[key] = _read_primitive(file, one, trust_sizes=trust_sizes)
+        _check_sizes(file, splats, [one.where for one, _ in placed])
+    read, scenes = dict[str, GaussianScene](), []
+    for where, one in splats.items():  # a comprehension adds a stack level in Python 3.11 only
+        read[where] = _read_primitive(file, one, trust_sizes=trust_sizes)
     for one, matrix in placed:
-        scenes.append(_moved(file, read[id(one)], matrix))
+        scenes.append(_moved(file, read[one.where], matrix))
     scene = scenes[0] if len(scenes) == 1 else merge(scenes)
     return change_axes(scene, AXES if axes is None else axes, SCENE_AXES)
 
@@ -195,14 +195,14 @@ def _local_matrix(node: _Node) -> Matrix:
     return matrix
 
 
-def _check_sizes(file: GltfFile, splats: dict[int, _Splats], placed: list[int]) -> None:
+def _check_sizes(file: GltfFile, splats: dict[str, _Splats], placed: list[str]) -> None:
     """Refuse nodes that repeat the same bytes too often."""
-    sizes = {key: _size(file, one) for key, one in splats.items()}
-    count, degree = (
-        sum(sizes[key][0] for key in placed),
-        max(degree for _, degree in sizes.values()),
-    )
-    check_expansion(file.path, count=count, sh_degree=degree, stored=file.stored)
+    counts, degrees = dict[str, int](), []
+    for where, one in splats.items():
+        counts[where], degree = _size(file, one)
+        degrees.append(degree)
+    count = sum(counts[where] for where in placed)
+    check_expansion(file.path, count=count, sh_degree=max(degrees), stored=file.stored)
 
 
 def _size(file: GltfFile, one: _Splats) -> tuple[int, int]:
