@@ -88,25 +88,17 @@ class Tried(Record):
     alpha_bias: float
 
 
-class SearchReport(Record):
-    """Report of a search for the smallest count that reaches a quality.
+class SearchReport(Tried):
+    """Report of a search for the smallest count that reaches a quality: that count, and its scores.
 
     Attributes:
         metric: Score to reach, PSNR or SSIM.
         target: Its value.
-        psnr: Mean PSNR of the result over the held-out views, dB, at most 60 each.
-        ssim: Mean SSIM of the result.
-        alpha_error: Mean absolute difference of accumulated alpha.
-        alpha_bias: Mean signed difference; negative if more of the background shows through.
         tried: All counts that were tried, in order.
     """
 
     metric: Literal["psnr", "ssim"]
     target: float
-    psnr: float
-    ssim: float
-    alpha_error: float
-    alpha_bias: float
     tried: tuple[Tried, ...]
 
 

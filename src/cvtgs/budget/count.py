@@ -190,9 +190,16 @@ def find_count(
             f"{total:,} Gaussians, reaches {reached}."
         )
     (small, report), quality = best
-    facts = {**quality.model_dump(exclude={"count"}), "tried": tuple(tried)}
-    search = SearchReport(metric=target.metric, target=target.value, **facts)
-    return Found(small, report.model_copy(update={"search": search}), **facts)
+    scores = quality.model_dump(exclude={"count"})
+    search = SearchReport(
+        metric=target.metric,
+        target=target.value,
+        tried=tuple(tried),
+        count=quality.count,
+        **scores,
+    )
+    report = report.model_copy(update={"search": search})
+    return Found(small, report, tried=search.tried, **scores)
 
 
 def heldout_scorer(full: GaussianScene, cameras: Cameras, *, listener: ProgressListener) -> Scorer:

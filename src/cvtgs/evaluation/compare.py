@@ -262,9 +262,10 @@ def check_seen(
     backend: BackendName = "auto",
     is_sample: bool = False,
 ) -> None:
-    """Raise if no camera sees anything of a scene, or one is no pinhole camera; warn if few see.
+    """Raise if no camera sees anything of a scene, or one is no pinhole camera.
 
-    A sample of a scene cannot tell that a camera sees nothing, so there is no warning.
+    Warn if few see anything, or if the near plane hides much. A sample of a scene cannot tell that
+    a camera sees nothing, so there is no warning of that.
     """
     to_matrices(cameras)  # alone, each would be "camera 0" in errors
     warn_of_near_plane(scene, cameras.singles(), name=name)
