@@ -31,6 +31,7 @@ except (ImportError, OSError) as error:
 
 Array = NDArray[Any]  # floats, all of one dtype, which numba infers
 Ints = NDArray[Any]  # integers
+Bools = NDArray[Any]
 
 PixelBox = tuple[int, int, int, int]
 """Half-open pixel ranges: first column, end column, first row, end row."""
@@ -147,8 +148,9 @@ class TileArrays(NamedTuple):
 
 
 class SplatArrays(NamedTuple):
-    """The splats in view, front to back."""
+    """Splats in view, front to back."""
 
     rows: Ints  # (m,) row of the Gaussian in the scene
     starts: Ints  # (m + 1,) start of each splat's intersections, in splat order
+    first: Ints  # (m,) the first tile that each splat touches
     packed: Array  # (m, 10) as returned by `cvtgs.rendering.projection.pack`

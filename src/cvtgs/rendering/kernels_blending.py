@@ -10,7 +10,15 @@ import math
 import numpy as np
 
 from cvtgs.math.parameters import MIN_ALPHA
-from cvtgs.rendering.compiled import Array, Ints, PixelBox, TileArrays, parallel, prange, serial
+from cvtgs.rendering.compiled import (
+    Array,
+    Ints,
+    PixelBox,
+    TileArrays,
+    parallel,
+    prange,
+    serial,
+)
 from cvtgs.rendering.kernels_tiles import LOG_MIN_ALPHA, box_of, span, tile_at
 from cvtgs.rendering.projection import MAX_ALPHA, MIN_TRANSMITTANCE
 
@@ -27,9 +35,9 @@ def copy_splats(packed: Array, lists: Ints, first: int, end: int, batch: Array) 
 
 
 @serial
-def all_open(box: PixelBox) -> Ints:
-    """Return a bit for every pixel of a tile, one integer per row."""
-    return np.full(box[3] - box[2], (np.int64(1) << (box[1] - box[0])) - 1, np.int64)
+def none_open(open_rows: Ints) -> bool:
+    """Return whether all pixels of a tile are finished."""
+    return not open_rows.any()
 
 
 @serial
@@ -48,44 +56,47 @@ def reached_columns(splat: Array, room: float, box: PixelBox) -> int:
 
 @parallel
 def composite_all(
-    packed: Array, tiles: TileArrays, centers: Array, image: Array, weights: Array
+    packed: Array,
+    tiles: TileArrays,
+    centers: Array,
+    image: Array,
+    open_rows: Ints,
+    weights: Array,
 ) -> None:
-    """Write weighted sums of red, green, blue and depth, and the transmittance, of each pixel.
+    """Add red, green, blue and depth to each pixel of ``image``; lower its transmittance.
 
-    If ``weights`` is not empty, also write the sum of ``alpha * T`` over the pixels of every
-    intersection of a splat and a tile, in splat order.
+    ``open_rows`` has a bit for each pixel of each tile that is 0 where finished. If ``weights`` is
+    not empty, also write the sum of ``alpha * T`` over the pixels of every intersection of a splat
+    and a tile, in splat order.
     """
     starts, lists, side = tiles
     height, width = image.shape[:2]
     for step in prange(len(starts) - 1):
         tile = tile_at(step, len(starts) - 1)
         box = box_of(tile, side, (width, height))
-        x0, x1, y0, y1 = box
-        layers = image[y0:y1, x0:x1]
-        for y in range(y1 - y0):
-            for x in range(x1 - x0):
-                for channel in range(4):
-                    layers[y, x, channel] = 0
-                layers[y, x, 4] = 1
-        blend_list(packed, lists[starts[tile] : starts[tile + 1]], box, centers, layers, weights)
+        state = (image[box[2] : box[3], box[0] : box[1]], open_rows[tile])
+        blend_list(packed, lists[starts[tile] : starts[tile + 1]], box, centers, state, weights)
 
 
 @serial
 def blend_list(
-    packed: Array, lists: Ints, box: PixelBox, centers: Array, layers: Array, weights: Array
+    packed: Array,
+    lists: Ints,
+    box: PixelBox,
+    centers: Array,
+    state: tuple[Array, Ints],
+    weights: Array,
 ) -> None:
     """Blend the splats of a tile until all of its pixels are finished."""
-    pending, open_rows = (box[1] - box[0]) * (box[3] - box[2]), all_open(box)
     batch = np.empty((BATCH, packed.shape[1]), packed.dtype)
     for start in range(0, len(lists), BATCH):
         end = min(start + BATCH, len(lists))
         copy_splats(packed, lists, start, end, batch)
         for entry in range(start, end):
-            finished, total = blend(batch[entry - start], box, centers, layers, open_rows)
-            pending -= finished
+            finished, total = blend(batch[entry - start], box, centers, state)
             if len(weights):
                 weights[lists[entry, 0]] = total
-            if pending == 0:
+            if finished and none_open(state[1]):
                 return
 
 
@@ -94,11 +105,13 @@ def blend(
     splat: Array,
     box: PixelBox,
     centers: Array,
-    layers: Array,
-    open_rows: Ints,
+    state: tuple[Array, Ints],
 ) -> tuple[int, float]:
-    """Blend one splat into a tile; return the number of pixels finished, and its summed weight."""
-    finished, total = 0, 0.0
+    """Blend one splat into a tile; return the number of pixels finished, and its summed weight.
+
+    ``state`` holds the layers of the tile's pixels, and a bit for each that is 0 where finished.
+    """
+    (layers, open_rows), finished, total = state, 0, 0.0
     x0, x1, y0, y1 = box
     one, least = centers.dtype.type(1), centers.dtype.type(MIN_TRANSMITTANCE)
     faintest, most = centers.dtype.type(MIN_ALPHA), centers.dtype.type(MAX_ALPHA)
@@ -139,58 +152,68 @@ def blend(
 
 
 @parallel
+def light_of_gradient(image: Array, grad: Array, behind: Array) -> None:
+    """Write the gradient times the layers of each pixel."""
+    for y in prange(image.shape[0]):
+        for x in range(image.shape[1]):
+            behind[y, x] = 0
+            for channel in range(5):
+                behind[y, x] += image[y, x, channel] * grad[y, x, channel]
+
+
+@parallel
 def composite_all_gradient(
     packed: Array,
     tiles: TileArrays,
     centers: Array,
-    image: Array,
     grad: Array,
+    state: tuple[Array, Array, Ints],
     per_intersection: Array,
 ) -> None:
-    """Write the gradient by the packed splat of every intersection, in splat order."""
+    """Write the gradient by the packed splat of every intersection, in splat order.
+
+    ``state`` holds for each pixel the transmittance in front of these splats (0 where finished) and
+    the gradient times all light from these splats and behind them, and ``open_rows`` as above.
+    """
     starts, lists, side = tiles
-    height, width = image.shape[:2]
+    transmittance, behind, open_rows = state
+    height, width = grad.shape[:2]
     for step in prange(len(starts) - 1):
         tile = tile_at(step, len(starts) - 1)
         box = box_of(tile, side, (width, height))
         x0, x1, y0, y1 = box
+        reaching, light = transmittance[y0:y1, x0:x1].copy(), behind[y0:y1, x0:x1].copy()
         blend_list_gradient(
             packed,
             lists[starts[tile] : starts[tile + 1]],
-            box,
-            centers,
-            (image[y0:y1, x0:x1], grad[y0:y1, x0:x1]),
+            (box, centers),
+            grad[y0:y1, x0:x1],
+            (reaching, light, open_rows[tile]),
             per_intersection,
         )
+        transmittance[y0:y1, x0:x1] = reaching
+        behind[y0:y1, x0:x1] = light
 
 
 @serial
 def blend_list_gradient(
     packed: Array,
     lists: Ints,
-    box: PixelBox,
-    centers: Array,
-    layers: tuple[Array, Array],
+    pixels: tuple[PixelBox, Array],
+    grad: Array,
+    state: tuple[Array, Array, Ints],
     per_intersection: Array,
 ) -> None:
     """Write the gradients of the splats of a tile until all of its pixels are finished."""
-    image, grad = layers
-    height, width = image.shape[:2]
-    transmittance = np.ones((height, width), image.dtype)
-    behind = np.zeros((height, width), image.dtype)
-    for y in range(height):
-        for x in range(width):
-            for channel in range(5):
-                behind[y, x] += image[y, x, channel] * grad[y, x, channel]
-    pending, state = height * width, (transmittance, behind, all_open(box))
+    box, centers = pixels
     batch = np.empty((BATCH, packed.shape[1]), packed.dtype)
     for start in range(0, len(lists), BATCH):
         end = min(start + BATCH, len(lists))
         copy_splats(packed, lists, start, end, batch)
         for entry in range(start, end):
             out = per_intersection[lists[entry, 0]]
-            pending -= blend_gradient(batch[entry - start], box, centers, grad, state, out)
-            if pending == 0:
+            finished = blend_gradient(batch[entry - start], box, centers, grad, state, out)
+            if finished and none_open(state[2]):
                 return
 
 

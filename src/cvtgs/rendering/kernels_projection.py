@@ -361,7 +361,7 @@ def project_all_gradient(
     means, quats, log_scales, logits, sh0, rest = gaussians
     of_means, of_quats, of_log_scales, of_logits, of_sh0, of_rest = gradients
     camera, _, degree, antialiased = settings
-    rows, starts, _ = splats
+    rows, starts = splats.rows, splats.starts
     for chunk in prange((len(rows) + CHUNK - 1) // CHUNK):
         grad, scratch = np.empty(10), np.empty((18, 3))
         offset, local, of_local, of_offset = scratch[0], scratch[1], scratch[2], scratch[3]

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from cvtgs.math.parameters import MIN_ALPHA
-from cvtgs.rendering.compiled import Array, Ints, PixelBox, parallel, prange, serial
+from cvtgs.rendering.compiled import Array, Bools, Ints, PixelBox, parallel, prange, serial
 
 SLACK = 1e-3
 LOG_MIN_ALPHA = math.log(MIN_ALPHA)
@@ -59,10 +59,10 @@ def tiles_of(
         first, last = strip(splat, reach, size, rows)
         if last < first:
             continue
-        for column in range(first // side, last // side + 1):
-            if count < most:
-                out[start + count] = row * across + column
-            count += 1
+        here = last // side - first // side + 1
+        for number in range(min(here, most - count)):
+            out[start + count + number] = row * across + first // side + number
+        count += here
     return count
 
 
@@ -87,15 +87,23 @@ def write_tiles(
 
 
 @serial
-def sort_by_tile(tile_ids: Ints, splat_starts: Ints, tile_starts: Ints, lists: Ints) -> None:
-    """Write the tiles' lists by counting sort: index in splat order, and splat."""
+def sort_by_tile(
+    tile_ids: Ints, splat_starts: Ints, is_open: Bools, tile_starts: Ints, lists: Ints
+) -> None:
+    """Write the lists of tiles by counting sort: index in splat order, and splat.
+
+    Tiles that are not open get empty lists.
+    """
     for tile_id in tile_ids:
-        tile_starts[tile_id + 1] += 1
+        if is_open[tile_id]:
+            tile_starts[tile_id + 1] += 1
     for tile in range(len(tile_starts) - 1):
         tile_starts[tile + 1] += tile_starts[tile]
     free = tile_starts.copy()
     for splat in range(len(splat_starts) - 1):
         for place in range(splat_starts[splat], splat_starts[splat + 1]):
+            if not is_open[tile_ids[place]]:
+                continue
             at = free[tile_ids[place]]
             free[tile_ids[place]] += 1
             lists[at, 0] = place
@@ -116,6 +124,14 @@ def tile_at(step: int, count: int) -> int:
     """Return the tile of a step; each tile occurs once."""
     number = np.int64(step)  # numba counts parallel loops in uint64, which % turns into floats
     return int(number * STRIDE % count if count % STRIDE else number)
+
+
+@serial
+def open_all(size: tuple[int, int], side: int, open_rows: Ints) -> None:
+    """Write a bit for every pixel of every tile, one integer per row."""
+    for tile in range(len(open_rows)):
+        x0, x1, y0, y1 = box_of(tile, side, size)
+        open_rows[tile, : y1 - y0] = (np.int64(1) << (x1 - x0)) - 1
 
 
 @serial

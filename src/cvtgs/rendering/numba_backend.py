@@ -21,14 +21,19 @@ from cvtgs.rendering.compiled import (
     TileArrays,
     for_each_camera,
 )
-from cvtgs.rendering.kernels_blending import composite_all, composite_all_gradient
+from cvtgs.rendering.kernels_blending import (
+    composite_all,
+    composite_all_gradient,
+    light_of_gradient,
+)
 from cvtgs.rendering.kernels_projection import project_all, project_all_gradient
-from cvtgs.rendering.kernels_tiles import count_tiles, sort_by_tile, write_tiles
+from cvtgs.rendering.kernels_tiles import count_tiles, open_all, sort_by_tile, write_tiles
 from cvtgs.rendering.kernels_weights import TileWeights
 from cvtgs.rendering.projection import Pinhole, to_pinholes
 from cvtgs.scene import GaussianScene
 
 SIDE = 16  # pixels along a tile's edge
+INTERSECTIONS = 2**22  # of splats and tiles that are listed at a time
 
 
 def require(device: torch.device) -> None:
@@ -55,7 +60,9 @@ def rasterize(
     loop; the embedding page of the docs shows how to save that CPU time.
 
     Memory per image: ``11 n`` numbers for n Gaussians, ``12 p`` bytes for p intersections of splats
-    and tiles, and the image. The backward pass needs ``10 p`` numbers at a time.
+    and tiles, and the image. The backward pass needs ``10 p`` numbers at a time. Where a scene has
+    more than four million intersections, its splats are blended in parts, front to back; tiles that
+    are opaque by then are left out.
     """
     tensors = [tensor.contiguous() for tensor in scene.tensors().values()]
     pinholes = to_pinholes(cameras)
@@ -85,13 +92,13 @@ def observe(
 
     def observe_one(pinhole: Pinhole) -> tuple[RasterOutput, Tensor]:
         settings = _settings(pinhole, sh_degree, scene)
-        splats, tiles = _splats_by_tile(gaussians, settings)
-        image = np.empty((settings.size[1], settings.size[0], 5), splats.packed.dtype)
-        weights = np.zeros(len(tiles.lists))
-        composite_all(splats.packed, tiles, _pixel_centers(image), image, weights)
-        sums = np.concatenate([[0.0], np.cumsum(weights)])[splats.starts]
         found = np.zeros(len(scene))
-        found[splats.rows] = np.diff(sums)
+        image, open_rows = _start_image(settings, gaussians.means.dtype)
+        for splats in _parts(_project(gaussians, settings)):
+            tiles, weights = _list_splats(splats, open_rows, settings), np.zeros(splats.starts[-1])
+            composite_all(splats.packed, tiles, _pixel_centers(image), image, open_rows, weights)
+            sums = np.concatenate([[0.0], np.cumsum(weights)])[splats.starts]
+            found[splats.rows] = np.diff(sums)
         layers = torch.from_numpy(image)[None]
         output = RasterOutput(rgb=layers[..., :3], depth=layers[..., 3], alpha=1 - layers[..., 4])
         return output, torch.from_numpy(found)
@@ -103,7 +110,8 @@ def blending_weights(scene: GaussianScene, camera: Cameras) -> TileWeights:
     """Return the weights of every Gaussian in every pixel of one image."""
     (pinhole,) = to_pinholes(camera)
     settings = _settings(pinhole, 0, scene)
-    splats, tiles = _splats_by_tile(_arrays(scene), settings)
+    splats = _project(_arrays(scene), settings)
+    tiles = _list_splats(splats, _open_rows(settings.size), settings)
     return TileWeights(splats, tiles, settings.size, count=len(scene))
 
 
@@ -113,17 +121,21 @@ def _arrays(scene: GaussianScene) -> GaussianArrays:
 
 
 class _Render(torch.autograd.Function):
-    """Render one image; the backward pass reuses the tile lists and blends again."""
+    """Render one image; the backward pass blends again, and reuses the list of a single part."""
 
     @staticmethod
     def forward(ctx: Any, settings: RasterSettings, *tensors: Tensor) -> Float[Tensor, "h w 5"]:
         gaussians = GaussianArrays(*(tensor.detach().numpy() for tensor in tensors))
-        splats, tiles = _splats_by_tile(gaussians, settings)
-        image = np.empty((settings.size[1], settings.size[0], 5), splats.packed.dtype)
-        composite_all(splats.packed, tiles, _pixel_centers(image), image, np.empty(0))
+        image, open_rows = _start_image(settings, gaussians.means.dtype)
+        projected, tiles = _project(gaussians, settings), None
+        for splats in _parts(projected):
+            tiles = _list_splats(splats, open_rows, settings)
+            centers, no_weights = _pixel_centers(image), np.empty(0)
+            composite_all(splats.packed, tiles, centers, image, open_rows, no_weights)
         result = torch.from_numpy(image)
         ctx.save_for_backward(result, *tensors)
-        ctx.settings, ctx.splats, ctx.tiles = settings, splats, tiles
+        ctx.settings, ctx.splats = settings, projected
+        ctx.tiles = tiles if projected.starts[-1] <= INTERSECTIONS else None
         return result
 
     @staticmethod
@@ -131,20 +143,40 @@ class _Render(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         image, *arrays = (tensor.detach().numpy() for tensor in ctx.saved_tensors)
         gaussians = GaussianArrays(*arrays)
-        per_intersection = np.zeros((len(ctx.tiles.lists), 10), image.dtype)
-        image_grad = grad.contiguous().numpy()
-        composite_all_gradient(
-            ctx.splats.packed, ctx.tiles, _pixel_centers(image), image, image_grad, per_intersection
-        )
         gradients = GaussianArrays(*(np.zeros_like(array) for array in arrays))
-        project_all_gradient(gaussians, ctx.settings, ctx.splats, per_intersection, gradients)
+        image_grad, open_rows = grad.contiguous().numpy(), _open_rows(ctx.settings.size)
+        behind = np.empty_like(image[..., 0])
+        light_of_gradient(image, image_grad, behind)
+        state = (np.ones_like(behind), behind, open_rows)
+        for splats in _parts(ctx.splats):
+            tiles = ctx.tiles or _list_splats(splats, open_rows, ctx.settings)
+            per_intersection = np.zeros((splats.starts[-1], 10), image.dtype)
+            composite_all_gradient(
+                splats.packed, tiles, _pixel_centers(image), image_grad, state, per_intersection
+            )
+            project_all_gradient(gaussians, ctx.settings, splats, per_intersection, gradients)
         return None, *(torch.from_numpy(gradient) for gradient in gradients)
 
 
-def _splats_by_tile(
-    gaussians: GaussianArrays, settings: RasterSettings
-) -> tuple[SplatArrays, TileArrays]:
-    """Project Gaussians, sort them by depth and list the splats of each tile."""
+def _start_image(
+    settings: RasterSettings, dtype: np.dtype[Any]
+) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
+    """Return an image without splats, and its open pixels."""
+    width, height = settings.size
+    open_rows, image = _open_rows(settings.size), np.zeros((height, width, 5), dtype)
+    image[..., 4] = 1
+    return image, open_rows
+
+
+def _open_rows(size: tuple[int, int]) -> NDArray[np.int64]:
+    """Return a bit for each pixel of each tile, one integer per row of a tile."""
+    open_rows = np.zeros((-(-size[0] // SIDE) * -(-size[1] // SIDE), SIDE), np.int64)
+    open_all(size, SIDE, open_rows)
+    return open_rows
+
+
+def _project(gaussians: GaussianArrays, settings: RasterSettings) -> SplatArrays:
+    """Project Gaussians, sort them by depth and count the tiles that each splat touches."""
     count = len(gaussians.means)
     packed, visible = np.empty((count, 10), gaussians.means.dtype), np.empty(count, np.bool_)
     depths = np.empty(count)  # float32 would often be equal for different depths
@@ -154,15 +186,34 @@ def _splats_by_tile(
     bits = torch.from_numpy(depths.view(np.int64)[rows])
     rows = rows[torch.sort(bits, stable=True).indices.numpy()]
     packed = packed.take(rows, axis=0)  # five times as fast as packed[rows]
-    splat_starts, first = np.zeros(len(rows) + 1, np.int64), np.empty(len(rows), np.int32)
-    count_tiles(packed, settings.size, SIDE, splat_starts[1:], first)
-    np.cumsum(splat_starts, out=splat_starts)
-    tile_ids = np.empty(splat_starts[-1], np.int32)
-    write_tiles(packed, settings.size, SIDE, splat_starts, first, tile_ids)
-    tiles = -(-settings.size[0] // SIDE) * -(-settings.size[1] // SIDE)
-    tile_starts, lists = np.zeros(tiles + 1, np.int64), np.empty((len(tile_ids), 2), np.int32)
-    sort_by_tile(tile_ids, splat_starts, tile_starts, lists)
-    return SplatArrays(rows, splat_starts, packed), TileArrays(tile_starts, lists, SIDE)
+    starts, first = np.zeros(len(rows) + 1, np.int64), np.empty(len(rows), np.int32)
+    count_tiles(packed, settings.size, SIDE, starts[1:], first)
+    np.cumsum(starts, out=starts)
+    return SplatArrays(rows, starts, first, packed)
+
+
+def _parts(splats: SplatArrays) -> Iterator[SplatArrays]:
+    """Split splats, front to back, into parts of at most ``INTERSECTIONS`` or of one splat."""
+    begin, count = 0, len(splats.rows)
+    while begin < count:
+        limit = splats.starts[begin] + INTERSECTIONS
+        end = max(begin + 1, int(np.searchsorted(splats.starts, limit, side="right")) - 1)
+        starts = splats.starts[begin : end + 1] - splats.starts[begin]
+        part = slice(begin, end)
+        yield SplatArrays(splats.rows[part], starts, splats.first[part], splats.packed[part])
+        begin = end
+
+
+def _list_splats(
+    splats: SplatArrays, open_rows: NDArray[np.int64], settings: RasterSettings
+) -> TileArrays:
+    """List the splats of each tile that has open pixels."""
+    tile_ids = np.empty(splats.starts[-1], np.int32)
+    write_tiles(splats.packed, settings.size, SIDE, splats.starts, splats.first, tile_ids)
+    starts, is_open = np.zeros(len(open_rows) + 1, np.int64), np.any(open_rows, axis=1)
+    lists = np.empty((len(tile_ids), 2), np.int32)
+    sort_by_tile(tile_ids, splats.starts, is_open, starts, lists)
+    return TileArrays(starts, lists[: starts[-1]], SIDE)
 
 
 def _settings(camera: Pinhole, sh_degree: int, scene: GaussianScene) -> RasterSettings:
