@@ -34,15 +34,18 @@ def test_an_embedding_program_passes_mypy(folder: Path) -> None:
 
 @pytest.mark.long
 def test_wrong_calls_are_found(folder: Path) -> None:
-    """The check can fail: three mistakes give three errors."""
+    """The check can fail: each mistake gives an error."""
     program = folder / "wrong.py"
     program.write_text(
-        "import cvtgs\n"
+        "import cvtgs\nfrom cvtgs.boxes import Box\n"
         "scene = cvtgs.load(3)\n"
         "cvtgs.Simplifier(device=None).simplify(scene, rho='much')\n"
+        "Box(min=(0, 0, 0), max=(1, 1, 1), low=3)\n"
+        "cvtgs.SimplifyConfig(sed=3)\n"
     )
     done = check(program, folder)
     assert done.stdout.count("[arg-type]") == 3, done.stdout
+    assert done.stdout.count("[call-arg]") == 2, done.stdout
 
 
 @pytest.mark.slow

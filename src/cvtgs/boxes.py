@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import UnionType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pydantic
@@ -54,18 +54,20 @@ class Box(pydantic.BaseModel):
     min: Corner
     max: Corner
 
-    def __init__(self, /, **values: Any) -> None:
-        try:
-            super().__init__(**values)
-        except pydantic.ValidationError:
-            found = ", ".join(f"{name}={shown(value)}" for name, value in values.items())
-            raise InvalidArgumentError(
-                "a box must have a min and a max of three finite numbers each, min nowhere above "
-                f"max, found {found or 'neither'}."
-            ) from None
+    if not TYPE_CHECKING:  # or type checkers would accept any argument
 
-    # Boxes of files are checked without a call of __init__, so errors name the place in the file.
-    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+        def __init__(self, /, **values: object) -> None:
+            try:
+                super().__init__(**values)
+            except pydantic.ValidationError:
+                found = ", ".join(f"{name}={shown(value)}" for name, value in values.items())
+                raise InvalidArgumentError(
+                    "a box must have a min and a max of three finite numbers each, min nowhere "
+                    f"above max, found {found or 'neither'}."
+                ) from None
+
+        # Boxes of files are checked without a call of __init__, so errors name the place there.
+        __init__.__pydantic_base_init__ = True
 
     @pydantic.model_validator(mode="after")
     def _in_order(self) -> "Box":

@@ -86,6 +86,24 @@ def check_range(values: Tensor, most: float, name: str) -> None:
             )
 
 
+def check_amounts(amounts: object, name: str, count: int, *, ignored: int = 0) -> None:
+    """Raise unless there is a number of at least 0 for every Gaussian but the first, ignored ones.
+
+    It waits for the device.
+    """
+    shape = tuple(amounts.shape) if isinstance(amounts, Tensor) else type(amounts).__name__
+    if not isinstance(amounts, Tensor) or shape != (count,):
+        raise InvalidArgumentError(
+            f"{name} must be a tensor of one number for each of {count} Gaussians, found {shape}."
+        )
+    wrong = (~(amounts[ignored:] >= 0)).nonzero()[:, 0].tolist()  # NaN too
+    if wrong:
+        raise InvalidArgumentError(
+            f"{name} must be at least 0; {len(wrong)} of {count} are not, the first is "
+            f"{float(amounts[ignored + wrong[0]])} in row {ignored + wrong[0]}."
+        )
+
+
 def row_numbers(
     rows: slice | Sequence[int] | Tensor, count: int, *, things: str, device: torch.device
 ) -> Int[Tensor, "m"]:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Partition
-from cvtgs.checks import checked
+from cvtgs.checks import check_amounts, checked
 from cvtgs.config import MatchConfig
 from cvtgs.counts import checked_whole
 from cvtgs.errors import InvalidArgumentError
@@ -19,7 +19,7 @@ from cvtgs.math import parameters
 from cvtgs.math.segments import segment_sum
 from cvtgs.math.spherical_harmonics import SH_C0, evaluate, rest_basis
 from cvtgs.rendering import BlendingWeights, ObservedViews, blending_weights, contributions, render
-from cvtgs.rendering.render import check_amounts, check_observed
+from cvtgs.rendering.render import check_observed
 from cvtgs.report import MatchReport
 from cvtgs.scene import GaussianScene
 

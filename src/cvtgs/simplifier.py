@@ -196,8 +196,10 @@ def _chosen_config(
         return SimplifyConfig(preset=preset)
     if isinstance(config, str):
         return SimplifyConfig(preset=config)
-    if config is None or isinstance(config, SimplifyConfig):
-        return config
+    if config is None:
+        return None
+    if isinstance(config, SimplifyConfig):  # pydantic's model_copy checks nothing
+        return SimplifyConfig.from_mapping(config.model_dump(warnings=False))
     raise InvalidArgumentError(
         f"config must be a SimplifyConfig or the name of a preset, found {shown(config)}."
     )

@@ -7,6 +7,7 @@ import torch
 
 import cvtgs.synthetic
 from cvtgs.cameras import Cameras, look_at
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.rendering import projection, render
 from render_cases import BACKENDS, MIP, backends
 from scenes import random_scene
@@ -160,3 +161,18 @@ def test_needles_that_vanish_when_compensated_have_finite_gradients() -> None:
     (gradient,) = torch.autograd.grad(survival.sum(), axes)
     assert 0.0 < survival.item() < 1 / 255
     assert not gradient.any()
+
+
+@backends
+def test_gradients_cannot_be_differentiated(backend):
+    """Where the loss is linear, torch itself would give zeros, or a part of the derivative."""
+    scene = smooth_scene(0, ())
+    leaf = scene.log_scales.clone().requires_grad_()
+    image = render(scene.with_tensors({"log_scales": leaf}, {}), FEW, backend=backend).rgb
+    (once,) = torch.autograd.grad(image.mean(), leaf, retain_graph=True)
+    (gradient,) = torch.autograd.grad(image.mean(), leaf, create_graph=True)
+    assert torch.equal(gradient, once)
+    with pytest.raises(InvalidArgumentError, match="first derivatives only"):
+        torch.autograd.grad(gradient.square().sum(), leaf, retain_graph=True)
+    with pytest.raises(InvalidArgumentError, match="first derivatives only"):
+        (image.mean() + gradient.square().sum()).backward()

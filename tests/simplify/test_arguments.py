@@ -34,6 +34,41 @@ def test_a_preset_is_chosen_by_its_name():
         Simplifier(preset="fast", config="fast")
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seed": -5}, r"seed: input should be greater than or equal to 0, found -5\."),
+        ({"cvt": 3}, r"cvt: holds settings, found 3\."),
+        ({"preset": "quick"}, "preset must be one of .*found 'quick'"),
+    ],
+)
+def test_an_unchecked_copy_of_a_configuration_is_checked(changes, message):
+    copy = SimplifyConfig().model_copy(update=changes)
+    with pytest.raises(ConfigError, match=message):
+        Simplifier(config=copy, device="cpu")
+
+
+def test_sections_of_a_copied_configuration_may_be_mappings():
+    fast = SimplifyConfig(preset="fast")
+    copy = fast.model_copy(update={"merge": {"inflation": 0.2}})
+    merge = fast.merge.model_copy(update={"inflation": 0.2})
+    assert Simplifier(config=copy, device="cpu").config == SimplifyConfig(
+        preset="fast", merge=merge
+    )
+
+
+def test_a_configuration_of_another_class_is_that_of_its_preset_or_refused():
+    class Fast(SimplifyConfig):
+        preset: str = "fast"
+
+    class Tagged(SimplifyConfig):
+        tag: str = "nightly"
+
+    assert Simplifier(config=Fast(), device="cpu").config == SimplifyConfig(preset="fast")
+    with pytest.raises(ConfigError, match="tag: is not a known setting"):  # reports would lose it
+        Simplifier(config=Tagged(), device="cpu")
+
+
 def test_one_call_takes_a_scene_or_a_path(tmp_path):
     scene, path = random_scene(300), tmp_path / "scene.ply"
     scene.save(path)

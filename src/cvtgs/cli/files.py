@@ -108,8 +108,8 @@ def read_edits(options: argparse.Namespace) -> list[tuple[str, Edit]]:
 
     edit, edits, regions = cvtgs.edit, list[tuple[str, Edit]](), list[Box | Sphere]()
     for text in options.crop_box:
-        numbers = _numbers("--crop-box", text, 6)
-        regions.append(Box(min=tuple(numbers[:3]), max=tuple(numbers[3:])))
+        x0, y0, z0, x1, y1, z1 = _numbers("--crop-box", text, 6)
+        regions.append(Box(min=(x0, y0, z0), max=(x1, y1, z1)))
     for text in options.crop_sphere:
         x, y, z, radius = _numbers("--crop-sphere", text, 4)
         regions.append(Sphere(center=(x, y, z), radius=radius))

@@ -163,7 +163,7 @@ class SimplifyConfig(Section):
     def _start_from_preset(cls, values: Any) -> Any:
         if not isinstance(values, Mapping):
             return values
-        name = values.get("preset", "standard")
+        name = values.get("preset", cls.model_fields["preset"].default)
         if not isinstance(name, str) or name not in PRESETS:
             raise unknown_preset(name)
         return _merged(PRESETS[name], values)

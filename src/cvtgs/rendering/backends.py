@@ -4,7 +4,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Literal, Protocol, cast, get_args
+from typing import Any, Literal, Protocol, cast, get_args
 
 import torch
 from jaxtyping import Float, Int
@@ -125,6 +125,47 @@ def _backend(name: str, device: torch.device) -> Backend:
     backend = cast("Backend", import_module(f"cvtgs.rendering.{name}_backend"))
     backend.require(device)
     return backend
+
+
+def differentiable_once(scene: GaussianScene) -> GaussianScene:
+    """Return the scene, with gradients that raise where they are differentiated in turn.
+
+    Backends compute gradients without a graph: second derivatives would be 0, or lack a part.
+    """
+    leaves = {name: tensor for name, tensor in scene.tensors().items() if tensor.requires_grad}
+    guarded = {name: _Once.apply(tensor) for name, tensor in leaves.items()}  # type: ignore[no-untyped-call]
+    return scene.with_tensors(guarded, {}) if guarded and torch.is_grad_enabled() else scene
+
+
+class _Once(torch.autograd.Function):
+    """The identity; its gradient is followed by :class:`_Twice` if a graph is made of it."""
+
+    @staticmethod
+    def forward(ctx: Any, tensor: Tensor) -> Tensor:
+        ctx.save_for_backward(tensor)
+        return tensor.view_as(tensor)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        if not torch.is_grad_enabled():
+            return grad
+        found: Tensor = _Twice.apply(grad, *ctx.saved_tensors)  # type: ignore[no-untyped-call]
+        return found
+
+
+class _Twice(torch.autograd.Function):
+    """Its first argument, which cannot be differentiated by any."""
+
+    @staticmethod
+    def forward(_: Any, grad: Tensor, tensor: Tensor) -> Tensor:
+        del tensor
+        return grad.view_as(grad)
+
+    @staticmethod
+    def backward(_: Any, *grads: Tensor) -> None:
+        raise InvalidArgumentError(
+            "images of render have first derivatives only, found a derivative of a gradient."
+        )
 
 
 def collect_images(

@@ -15,7 +15,13 @@ from cvtgs.errors import InvalidArgumentError, memory_errors
 from cvtgs.math import parameters
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.rendering.backends import BackendName, BlendingWeights, choose_backend, without_gradients
+from cvtgs.rendering.backends import (
+    BackendName,
+    BlendingWeights,
+    choose_backend,
+    differentiable_once,
+    without_gradients,
+)
 from cvtgs.scene import GaussianScene, SceneLike, as_scene, check_scene
 from cvtgs.text import counted, short_repr, shown
 
@@ -66,9 +72,9 @@ def render(
     Mip-Splatting (Yu et al. 2024). 3DGS cuts Gaussians at three standard deviations, rounded up to
     tiles; here they end where alpha falls under 1/255, so images do not depend on tiles.
 
-    Images are differentiable with respect to means, quats, log scales, opacity logits, sh0, shN and
-    the background; cameras are constants. Gaussians with a non-finite position, shape, opacity or
-    (on a CPU) colour contribute nothing. Autocast of torch has no effect.
+    Images are differentiable, once, with respect to means, quats, log scales, opacity logits, sh0,
+    shN and the background; cameras are constants. Gaussians with a non-finite position, shape,
+    opacity or (on a CPU) colour contribute nothing. Autocast of torch has no effect.
 
     Memory: each backend's ``rasterize`` states its formula. Cameras are rendered one by one, by
     ``numba`` without gradients up to four at a time, by ``gsplat`` as many as have four million
@@ -115,7 +121,8 @@ def render(
     name, chosen = choose_backend(backend, scene.device)
     size = f"{len(cameras):,} x {cameras.width:,} x {cameras.height:,} pixels"
     with memory_errors(f"rendering {size}", "render fewer or smaller images"):
-        output = chosen.rasterize(scene, cameras, sh_degree=degree, listener=listener)
+        once = differentiable_once(scene)
+        output = chosen.rasterize(once, cameras, sh_degree=degree, listener=listener)
     if behind is None:
         rgb = output.rgb.contiguous()
     else:
@@ -202,24 +209,6 @@ def check_observed(views: object, name: str) -> None:
         raise InvalidArgumentError(
             f"{name} must be ObservedViews, as cvtgs.rendering.observe returns them; "
             f"found {type(views).__name__}."
-        )
-
-
-def check_amounts(amounts: object, name: str, count: int, *, ignored: int = 0) -> None:
-    """Raise unless there is a number of at least 0 for every Gaussian but the first, ignored ones.
-
-    It waits for the device.
-    """
-    shape = tuple(amounts.shape) if isinstance(amounts, Tensor) else type(amounts).__name__
-    if not isinstance(amounts, Tensor) or shape != (count,):
-        raise InvalidArgumentError(
-            f"{name} must be a tensor of one number for each of {count} Gaussians, found {shape}."
-        )
-    wrong = (~(amounts[ignored:] >= 0)).nonzero()[:, 0].tolist()  # NaN too
-    if wrong:
-        raise InvalidArgumentError(
-            f"{name} must be at least 0; {len(wrong)} of {count} are not, the first is "
-            f"{float(amounts[ignored + wrong[0]])} in row {ignored + wrong[0]}."
         )
 
 
