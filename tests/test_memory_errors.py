@@ -126,3 +126,14 @@ def test_only_commands_that_have_blocks_advise_them(
         "cvtgs: error: cvtgs demo needs more memory than is available; free some, or ask for less, "
         "and use --device cpu if a GPU ran out.\n"
     )
+
+
+def test_too_little_memory_for_torch(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def load() -> None:
+        raise NO_MEMORY["loader"]
+
+    monkeypatch.setattr("cvtgs.cli.main.load_torch", load)
+    assert main(["info", "a.ply"]) == 1
+    assert capsys.readouterr().err.startswith("cvtgs: error: cvtgs info needs more memory than is")

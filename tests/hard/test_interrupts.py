@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import cvtgs
+from cvtgs.cli.main import main
 from cvtgs.errors import OutputError
 from cvtgs.io import atomic_output
 from cvtgs.io.tensors import save_tensors
@@ -143,3 +144,18 @@ def test_two_writers_of_the_same_file_do_not_mix(tmp_path):
         one.write(b"1" * 1000)
     assert path.read_bytes() == b"1" * 2000
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("before", [signal.SIG_DFL, signal.SIG_IGN], ids=["terminal", "nohup"])
+def test_a_closed_terminal_ends_a_run_unless_nohup_started_it(before, monkeypatch, capsys):
+    def show(options):
+        signal.raise_signal(signal.SIGHUP)
+
+    monkeypatch.setattr("cvtgs.cli.files.show_info", show)
+    original = signal.signal(signal.SIGHUP, before)
+    try:
+        assert main(["info", "a.ply"]) == (0 if before == signal.SIG_IGN else 129)
+        assert signal.getsignal(signal.SIGHUP) == before
+    finally:
+        signal.signal(signal.SIGHUP, original)
+    assert capsys.readouterr() == ("", "")

@@ -34,14 +34,14 @@ from cvtgs.text import printable_name
 WRITE_SEVERAL = ("levels", "render", "compare", "tradeoff", "demo", "train")
 """Commands that write several files to one folder, which only one run at a time may do."""
 
-INTERRUPTED, TERMINATED, PIPE_CLOSED = 130, 143, 141
+INTERRUPTED, PIPE_CLOSED = 130, 141  # exit status: 128 and the number of the signal
 BLOCKS_ADVICE = "process a binary .ply in blocks with --memory AMOUNT, for example 2GB"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status."""
     stop = _Stop()
-    before = signal.signal(signal.SIGINT, stop), signal.signal(signal.SIGTERM, stop)
+    before = {number: signal.signal(number, stop) for number in _stop_signals()}
     hook, sys.unraisablehook = sys.unraisablehook, stop.notice
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
@@ -65,9 +65,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 1
         finally:
             sys.unraisablehook = hook
-            for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
+            for number, handler in before.items():
                 signal.signal(number, handler)
     return 0
+
+
+def _stop_signals() -> list[signal.Signals]:
+    """Return the signals that end a run: that of a closed terminal only if nohup leaves it on."""
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if sys.platform != "win32" and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
+        numbers.append(signal.SIGHUP)
+    return numbers
 
 
 def _is_closed_pipe(error: BaseException | None) -> bool:
@@ -86,22 +94,27 @@ def _run(words: Sequence[str], stop: "_Stop") -> None:
     except SystemExit:  # after --help and --version, whose text may still be in a buffer
         flush_output()
         raise
-    if options.command != "completion":  # needs no tensors, and starts faster without them
-        with stop.held():  # an interrupted import of torch may end in its C++ code
-            load_torch()
     otherwise = BLOCKS_ADVICE if hasattr(options, "memory") else "ask for less"
     advice = f"free some, or {otherwise}, and use --device cpu if a GPU ran out"
     advised = memory_errors(f"cvtgs {options.command}", advice)
-    with advised, _without_empty_folder(options), _lock(options):
-        for name in ("input", "reference"):
-            check_one_scene(getattr(options, name, ""))
-            if str(getattr(options, name, "")) == STREAM and options.command != "info":
-                raise InvalidArgumentError(
-                    f"{options.command} needs a file; simplify, convert and info read standard "
-                    f"input (-)."
-                )
-        options.run(options)
+    with advised:
+        if options.command != "completion":  # needs no tensors, and starts faster without them
+            with stop.held():  # an interrupted import of torch may end in its C++ code
+                load_torch()
+        with _without_empty_folder(options), _lock(options):
+            _run_command(options)
     flush_output()
+
+
+def _run_command(options: argparse.Namespace) -> None:
+    for name in ("input", "reference"):
+        check_one_scene(getattr(options, name, ""))
+        if str(getattr(options, name, "")) == STREAM and options.command != "info":
+            raise InvalidArgumentError(
+                f"{options.command} needs a file; simplify, convert and info read standard "
+                f"input (-)."
+            )
+    options.run(options)
 
 
 def _lock(options: argparse.Namespace) -> AbstractContextManager[None]:
@@ -143,7 +156,7 @@ def run_process() -> NoReturn:
         code = main()
     except SystemExit as stop:
         code = stop.code
-    for number in (signal.SIGINT, signal.SIGTERM):  # the exit status is final
+    for number in _stop_signals():  # the exit status is final
         signal.signal(number, signal.SIG_IGN)
     for descriptor, file in ((1, sys.stdout), (2, sys.stderr)):
         try:
@@ -167,14 +180,14 @@ def _fill_closed_streams() -> None:
 
 
 class _Stop:
-    """A handler of SIGINT and SIGTERM that raises KeyboardInterrupt and records the exit status."""
+    """A handler of signals that raises KeyboardInterrupt and records the exit status."""
 
     def __init__(self) -> None:
         self.code: int | None = None
         self.is_held = False
 
     def __call__(self, signum: int, frame: FrameType | None) -> None:
-        self.code = INTERRUPTED if signum == signal.SIGINT else TERMINATED
+        self.code = 128 + signum
         if not self.is_held:
             raise KeyboardInterrupt
 
@@ -195,7 +208,7 @@ class _Stop:
             sys.__unraisablehook__(event)
             return
         if event.exc_type is KeyboardInterrupt:
-            number = signal.SIGINT if self.code == INTERRUPTED else signal.SIGTERM
+            number = self.code - 128
             while True:
                 with suppress(KeyboardInterrupt):  # on a busy machine, it comes before the end
                     again = threading.Timer(0.01, signal.raise_signal, (number,))
