@@ -13,6 +13,7 @@ import cvtgs
 from cvtgs.devices import (
     HOST,
     MOST_THREADS,
+    check_computes,
     chosen_device,
     chunk_length,
     core_count,
@@ -27,7 +28,7 @@ from cvtgs.devices import (
     usable_device,
     within_memory,
 )
-from cvtgs.errors import DeviceError, OutOfMemoryError
+from cvtgs.errors import DeviceError, OutOfMemoryError, memory_errors
 from pretended_device import pretended_cuda
 from scenes import same_bits
 
@@ -67,10 +68,16 @@ def test_tensors_that_are_there_do_not_move():
 
 @pytest.mark.parametrize(
     ("has_cuda", "home", "found"),
-    [(False, "cpu", "cpu"), (True, "cpu", "cuda"), (True, "meta", "meta"), (False, "meta", "meta")],
+    [
+        (False, "cpu", "cpu"),
+        (True, "cpu", "cuda:3"),
+        (True, "meta", "meta"),
+        (False, "meta", "meta"),
+    ],
 )
 def test_auto_is_cuda_for_data_on_the_cpu(monkeypatch, has_cuda, home, found):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: has_cuda)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 3)
     assert chosen_device("auto", home) == torch.device(found)
 
 
@@ -81,6 +88,33 @@ def test_chunks_are_longer_where_launches_are_expensive(monkeypatch, gigabytes, 
     assert chunk_length(7, torch.device("cpu")) == 7
     assert chunk_length(7, torch.device("meta")) == 896
     assert chunk_length(7, torch.device("cuda")) == 7 * factor
+
+
+def test_devices_without_float64_are_not_computed_on(monkeypatch):
+    def empty(*size, dtype=None, device=None):
+        if dtype == torch.float64 and torch.device(device).type in ("meta", "mps"):
+            raise TypeError("Cannot convert a MPS Tensor to float64 dtype")
+        return original(*size, dtype=dtype, device=device)
+
+    original = torch.empty
+    monkeypatch.setattr(torch, "empty", empty)
+    assert chosen_device("auto", "meta") == torch.device("cpu")
+    assert chosen_device("cpu") == torch.device("cpu")
+    with pytest.raises(DeviceError, match=r"'meta' cannot be used here: its tensors have no"):
+        check_computes(torch.device("meta"))
+    with pytest.raises(DeviceError, match=r"'mps' cannot be used here: it has no float64"):
+        check_computes(torch.device("mps"))
+
+
+def test_images_that_do_not_fit_lead_to_the_cpu_as_well():
+    def compute(device: torch.device, note: str) -> str:
+        with memory_errors("rendering", "render fewer"):
+            if device.type != "cpu":
+                raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB")
+        return note
+
+    note = within_memory(compute, torch.device("meta"), work="a test", may_leave=True)
+    assert note == "meta ran out of memory; computed on the CPU"
 
 
 @pytest.mark.parametrize("may_leave", [True, False])

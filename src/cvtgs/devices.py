@@ -70,8 +70,7 @@ def usable_device(device: str | torch.device) -> torch.device:
             f"device must be a name such as 'cpu' or a torch.device, found {device!r}."
         )
     try:
-        resolved = torch.device(device)
-        torch.empty(0, device=resolved)
+        resolved = torch.empty(0, device=torch.device(device)).device  # cuda is cuda:0
     except (RuntimeError, AssertionError, NotImplementedError, ImportError) as error:
         reason = shortened(re.split(r"\.?\n|\. |\.$", str(error))[0], 120)
         others = "'cpu'"
@@ -84,14 +83,37 @@ def usable_device(device: str | torch.device) -> torch.device:
 
 
 def chosen_device(device: str | torch.device, home: str | torch.device = "cpu") -> torch.device:
-    """Return the device to compute on; for ``auto``, CUDA (if any) for the CPU, else ``home``."""
+    """Return the device to compute on.
+
+    ``auto`` is CUDA, if any, for a scene on the CPU, else ``home``, or the CPU if ``home`` has no
+    float64.
+    """
     if device != "auto":
         named = usable_device(device)
-        if named.type == "meta":
-            raise DeviceError("device 'meta' cannot be used here: its tensors have no values.")
+        check_computes(named)
         return named
     home = torch.device(home)
-    return torch.device("cuda") if home.type == "cpu" and torch.cuda.is_available() else home
+    if home.type == "cpu" and torch.cuda.is_available():
+        return torch.device(f"cuda:{torch.cuda.current_device()}")
+    return home if _has_float64(home) else HOST
+
+
+def check_computes(device: torch.device) -> None:
+    """Raise unless a device holds numbers, also in float64: ``mps`` does not."""
+    if device.type == "meta":
+        raise DeviceError("device 'meta' cannot be used here: its tensors have no values.")
+    if not _has_float64(device):
+        raise DeviceError(f"device '{device}' cannot be used here: it has no float64; use 'cpu'.")
+
+
+def _has_float64(device: torch.device) -> bool:
+    if device.type in ("cpu", "cuda"):
+        return True
+    try:
+        torch.empty(0, dtype=torch.float64, device=device)
+    except (TypeError, RuntimeError):
+        return False
+    return True
 
 
 def device_name(device: torch.device) -> str:
@@ -159,7 +181,7 @@ def within_memory(
         token = _SHORT_CHUNKS.set(is_short)
         try:
             return compute(device, note)
-        except RuntimeError as error:
+        except (RuntimeError, OutOfMemoryError) as error:  # the latter of `render`
             if device.type == "cpu" or not is_out_of_memory(error):
                 raise
         finally:

@@ -47,6 +47,22 @@ def test_images_and_gradients(dtype):
         torch.testing.assert_close(one, same, **CLOSE[dtype])
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+@pytest.mark.parametrize("name", ["sh0", "shN"])
+def test_colors_that_are_not_finite_are_not_rendered(name, value):
+    scene, cameras = random_scene(40, degree=1), around()
+    poisoned = scene.tensors()[name].clone()
+    poisoned[::5] = value
+    scene = scene.with_tensors({name: poisoned}, {})
+    wanted = render(scene, cameras, backend="torch", depth=True)
+    with pretended_cuda():
+        found = render(scene.to("cuda"), cameras, depth=True)
+        images = {name: getattr(found, name).cpu() for name in ("rgb", "alpha", "depth")}
+    assert wanted.rgb.isfinite().all()
+    for layer, image in images.items():
+        torch.testing.assert_close(image, getattr(wanted, layer), **CLOSE[torch.float32])
+
+
 @pytest.fixture
 def _torch_only(monkeypatch) -> None:
     """Render by the torch backend on the CPU too."""

@@ -44,6 +44,23 @@ def test_scenes_of_any_size_are_drawn(scale):
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("sh0", torch.nan), ("sh0", torch.inf), ("shN", torch.nan)]
+)
+def test_colors_that_are_not_finite_are_not_drawn(name, value):
+    scene, cameras = random_scene(40, degree=1), around(2)
+    poisoned = scene.tensors()[name].clone()
+    poisoned[::5] = value
+    scene = scene.with_tensors({name: poisoned}, {})
+    found, wanted = (
+        backend.rasterize(scene, cameras, sh_degree=1)
+        for backend in (gsplat_backend, torch_backend)
+    )
+    assert wanted.rgb.isfinite().all()
+    torch.testing.assert_close(found.rgb, wanted.rgb, rtol=0, atol=1e-3)
+    torch.testing.assert_close(found.alpha, wanted.alpha, rtol=0, atol=1e-3)
+
+
 def test_a_camera_far_away_does_not_blur_the_images_of_others():
     cameras = around(3)
     viewmats = cameras.viewmats.clone()

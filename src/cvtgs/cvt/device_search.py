@@ -9,6 +9,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -353,12 +354,18 @@ def _fast_distances(
 @contextmanager
 def _full_float32() -> Iterator[None]:
     """Multiply matrices in float32, even if the program allows fewer bits (TF32)."""
-    before = torch.get_float32_matmul_precision()
-    if before == "highest":
+    try:
+        before, choose = torch.get_float32_matmul_precision(), torch.set_float32_matmul_precision
+        full = "highest"
+    except RuntimeError:  # the program has set it by the names of torch 2.9 and newer
+        matmul = torch.backends.cuda.matmul
+        before, choose = matmul.fp32_precision, partial(setattr, matmul, "fp32_precision")
+        full = "ieee"
+    if before == full:
         yield
         return
-    torch.set_float32_matmul_precision("highest")
+    choose(full)
     try:
         yield
     finally:
-        torch.set_float32_matmul_precision(before)
+        choose(before)

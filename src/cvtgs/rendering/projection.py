@@ -197,13 +197,17 @@ def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
     order = _front_to_back(centers, ellipses, opacities, _depths(means, beside), camera)
     colors = _colors(scene, rows[order], offsets[order], sh_degree)
     finite = colors.isfinite().all(dim=1)
-    if colors.device.type == "cpu" and not bool(finite.all()):  # elsewhere, the host would wait
-        order, colors = order[finite], colors[finite]
+    opacities = opacities[order]
+    if colors.device.type != "cpu":  # the host would wait to learn how many are left
+        opacities = torch.where(finite, opacities, 0)
+        colors = torch.where(finite[:, None], colors, 0)
+    elif not bool(finite.all()):
+        order, opacities, colors = order[finite], opacities[finite], colors[finite]
     return Splats(
         rows=rows[order],
         centers=centers[order],
         ellipses=ellipses[order],
-        opacities=opacities[order],
+        opacities=opacities,
         colors=colors,
         depths=local[:, 2][order],
     )

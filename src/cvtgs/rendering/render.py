@@ -74,7 +74,7 @@ def render(
 
     Images are differentiable, once, with respect to means, quats, log scales, opacity logits, sh0,
     shN and the background; cameras are constants. Gaussians with a non-finite position, shape,
-    opacity or (on a CPU) colour contribute nothing. Autocast of torch has no effect.
+    opacity or colour contribute nothing. Autocast of torch has no effect.
 
     Memory: each backend's ``rasterize`` states its formula. Cameras are rendered one by one, by
     ``numba`` without gradients up to four at a time, by ``gsplat`` as many as have four million

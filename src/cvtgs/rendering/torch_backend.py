@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from cvtgs.cameras import Cameras
+from cvtgs.devices import check_computes
 from cvtgs.math import segments
 from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.math.spherical_harmonics import SH_C0
@@ -56,7 +57,9 @@ class TileLists:
 
 
 def require(device: torch.device) -> None:
-    """Accept every device."""
+    """Accept every device that has float64."""
+    if device.type != "meta":  # for shapes without values
+        check_computes(device)
 
 
 def rasterize(
