@@ -22,6 +22,11 @@ def torch_error() -> RuntimeError:
     raise AssertionError
 
 
+def with_number(error: OSError, winerror: int) -> OSError:
+    error.winerror = winerror  # type: ignore[attr-defined,unused-ignore]  # that of Windows
+    return error
+
+
 NO_MEMORY = {
     "python": MemoryError(),
     "torch": torch_error(),
@@ -33,6 +38,9 @@ NO_MEMORY = {
     "system": OSError(errno.ENOMEM, "Cannot allocate memory"),
     "loader": ImportError("libtorch.so: failed to map segment from shared object"),
     "threads": RuntimeError("can't start new thread"),
+    "loader on Windows": ImportError("DLL load failed: The paging file is too small for this"),
+    "mapping on Windows": RuntimeError("Couldn't open file mapping: <a>, error code: <1455>"),
+    "system on Windows, translated": with_number(OSError(22, "Die Auslagerungsdatei ist zu"), 1455),
 }
 
 

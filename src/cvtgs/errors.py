@@ -38,9 +38,12 @@ _ADDRESS = re.compile(r"(https?|ftp):/")
 _NO_MEMORY = re.compile(
     r"(?i)(can.?not|can't|not enough|out of|failed to) (allocate )?memory|bad.?alloc|"
     r"ALLOC_FAILED|failed to map segment|can't start new thread|could not allocate|"
-    r"returned NULL without setting an exception"
+    r"returned NULL without setting an exception|paging file is too small|error code: <1455>"
 )
-"""Out-of-memory messages of torch, CUDA, the dynamic loader and Python's imports."""
+"""Out-of-memory messages of torch, CUDA, dynamic loaders and Python's imports."""
+
+_NO_MEMORY_ON_WINDOWS = (8, 14, 1455)
+"""NOT_ENOUGH_MEMORY, OUTOFMEMORY and COMMITMENT_LIMIT of Windows, whose texts are translated."""
 
 
 BLOCKS_ADVICE = (
@@ -199,6 +202,8 @@ def is_out_of_memory(error: BaseException) -> bool:
     if isinstance(error, MemoryError):
         return True
     if isinstance(error, OSError) and error.errno == errno.ENOMEM:
+        return True
+    if getattr(error, "winerror", None) in _NO_MEMORY_ON_WINDOWS:
         return True
     told = isinstance(error, RuntimeError | ImportError | OSError | SystemError)
     return told and _NO_MEMORY.search(str(error)) is not None

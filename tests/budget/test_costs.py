@@ -7,7 +7,7 @@ import pytest
 
 from cvtgs import SimplifyConfig
 from cvtgs.budget import CostModel, Work, choose_preset, cost_model, shipped_model
-from cvtgs.budget.calibrate import TRIALS, Trial, calibrate, undisturbed_seconds
+from cvtgs.budget.calibrate import CPU_STEP, TRIALS, Trial, calibrate, undisturbed_seconds
 from cvtgs.budget.costs import Measurement, fit_rates
 from cvtgs.clock import StageCost
 from cvtgs.errors import InvalidArgumentError
@@ -225,6 +225,20 @@ def test_only_a_stage_on_the_cpu_takes_no_longer_than_its_cpu_seconds(
         peak_device_memory_bytes=device_bytes,
     )
     assert undisturbed_seconds(cost) == seconds
+
+
+def test_the_coarse_cpu_clock_of_windows_is_not_read_for_short_stages(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def found(seconds: float) -> float:
+        memory = {"peak_memory_bytes": 0, "peak_device_memory_bytes": 0}
+        cpu = seconds // CPU_STEP * CPU_STEP
+        return undisturbed_seconds(StageCost(stage="x", seconds=seconds, cpu_seconds=cpu, **memory))
+
+    assert found(0.01) == 0
+    monkeypatch.setattr("sys.platform", "win32")
+    assert found(0.01) == 0.01
+    assert found(1.01) == 1.0
 
 
 def test_another_number_of_threads_is_measured_anew(

@@ -1,5 +1,6 @@
 """Completion of commands, options, values and files in shells."""
 
+import io
 import shutil
 import subprocess
 
@@ -25,6 +26,15 @@ def bash(capsys: pytest.CaptureFixture[str]) -> str:
         pytest.skip("needs bash")
     assert main(["completion", "bash"]) == 0
     return capsys.readouterr().out
+
+
+def test_scripts_have_no_line_ends_of_windows(monkeypatch):
+    written = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(written, newline="\r\n"))
+    for shell in ("bash", "zsh", "fish"):
+        assert main(["completion", shell]) == 0
+    assert written.getvalue().count(b"\n") > 50
+    assert b"\r" not in written.getvalue()
 
 
 def test_bash_completes_commands_options_values_and_files(bash, tmp_path, monkeypatch):

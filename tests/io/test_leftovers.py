@@ -260,3 +260,43 @@ def test_an_input_is_no_longer_mapped_when_it_is_replaced(
         look(path, path)
     assert len(held) > 0
     assert len(seen) > 2
+
+
+def held_once(change: Callable[..., None]) -> Callable[..., None]:
+    """Refuse the first call, as while a virus scanner reads a file."""
+    calls: list[int] = []
+
+    def act(*paths: Path, **options: int) -> None:
+        calls.append(1)
+        if len(calls) == 1:
+            raise PermissionError(errno.EACCES, "Access is denied", str(paths[0]))
+        change(*paths, **options)
+
+    return act
+
+
+@pytest.mark.parametrize("links", ["refused", "and renames"])
+def test_a_new_file_waits_for_a_scanner_on_disks_without_links(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: str
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(atomic, "_WINDOWS", True)
+    monkeypatch.setattr(atomic, "_WAITS", (0.0, 0.0))
+    monkeypatch.setattr(os, "link", refuse)
+    monkeypatch.setattr(os, "rename", held_once(os.rename) if links == "refused" else refuse)
+    monkeypatch.setattr(os, "replace", held_once(os.replace))
+    with atomic.atomic_output(tmp_path / "a.txt") as file:
+        file.write(b"whole")
+    assert (tmp_path / "a.txt").read_bytes() == b"whole"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_folder_waits_for_a_scanner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(atomic, "_WINDOWS", True)
+    monkeypatch.setattr(atomic, "_WAITS", (0.0, 0.0))
+    monkeypatch.setattr(os, "replace", held_once(os.replace))
+    (tmp_path / "hidden").mkdir()
+    atomic.replace_file(tmp_path / "hidden", tmp_path / "shown")
+    assert [path.name for path in tmp_path.iterdir()] == ["shown"]

@@ -1,6 +1,8 @@
 """``cvtgs completion``: a script that lets a shell complete commands, options and their values."""
 
 import argparse
+import io
+import sys
 from collections.abc import Iterator, Mapping
 from functools import partial
 
@@ -64,6 +66,8 @@ def completion(
     commands: Mapping[str, argparse.ArgumentParser], options: argparse.Namespace
 ) -> None:
     """Run ``cvtgs completion``."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(newline="\n")  # no shell takes the line ends of Windows
     if options.shell == "fish":
         say("\n".join(fish_lines(commands)))
     else:

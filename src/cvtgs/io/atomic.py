@@ -7,7 +7,7 @@ import secrets
 import stat
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PureWindowsPath
 from typing import BinaryIO
@@ -273,15 +273,20 @@ def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
 
 
 def replace_file(source: Path, target: Path) -> None:
-    """Move a file to a name; on Windows, wait for a moment if another program holds either file."""
+    """Move a file, or a folder to a new name; see :func:`_patiently` for Windows."""
+    _patiently(source.replace, target)
+
+
+def _patiently(move: Callable[[Path], object], target: Path) -> None:
+    """Move something; on Windows, wait for a moment if another program holds a file of it."""
     for seconds in _WAITS if _WINDOWS else ():
         try:
-            source.replace(target)
+            move(target)
         except PermissionError:
             time.sleep(seconds)
         else:
             return
-    source.replace(target)
+    move(target)
 
 
 def _link(temporary: Path, target: Path) -> None:
@@ -291,8 +296,8 @@ def _link(temporary: Path, target: Path) -> None:
 
 def _rename(temporary: Path, target: Path) -> None:
     """Rename unless the name exists, for disks without hard links (FAT, some shares)."""
-    if os.name == "nt":
-        temporary.rename(target)  # on Windows, this never replaces
+    if _WINDOWS:
+        _patiently(temporary.rename, target)  # on Windows, this never replaces
         return
     libc = ctypes.CDLL(None, use_errno=True)
     if not hasattr(libc, "renameat2"):
@@ -309,7 +314,7 @@ def _claim(temporary: Path, target: Path) -> None:
     try:
         with target.open("xb") as file:
             own = os.fstat(file.fileno())
-        temporary.replace(target)
+        replace_file(temporary, target)
     except BaseException:
         if own is not None and _is(target, own):
             target.unlink()

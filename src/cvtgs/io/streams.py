@@ -13,6 +13,7 @@ from traceback import clear_frames
 from typing import BinaryIO, Protocol, cast
 
 from cvtgs.errors import RENAMINGS, CvtgsError, FileFormatError, InputError, OutputError, reason_of
+from cvtgs.io.atomic import replace_file
 
 MEMORY_BYTES = 1 << 26  # a file is built in memory up to this size, and on disk beyond it
 CHUNK_BYTES = 1 << 16  # bytes of a stream that are read at once
@@ -74,7 +75,8 @@ def file_of(
                 f"{name}, found: {reason_of(error)}; TMPDIR sets another folder."
             ) from error
         suffix = format or _format_of(path, start)
-        path = path.rename(path.with_name(f"stream{suffix}"))
+        copy, path = path, path.with_name(f"stream{suffix}")
+        replace_file(copy, path)
         stack.enter_context(named_in_warnings(path, name))
         try:
             yield path

@@ -208,7 +208,7 @@ def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
     index, target = INDEX_NAMES[kind], Path(os.path.realpath(place))
     try:
         if not target.exists():  # then one rename publishes all files
-            hidden.rename(target)
+            replace_file(hidden, target)
             for path in target.glob(".*"):
                 _remove(path)
             return

@@ -5,6 +5,7 @@ import json
 import random
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cache, partial
 from pathlib import Path
@@ -288,10 +289,9 @@ def _cached(
 ) -> tuple[Content, ...]:
     """Read a cache file; write it first if it is missing or damaged."""
     if path.is_file():
-        try:
+        with suppress(ValueError, KeyError, TypeError):
             return unpack(map_tensors(path)[0])
-        except (ValueError, KeyError, TypeError):
-            path.unlink()
+        path.unlink()  # now that nothing maps it: Windows would refuse
     save_tensors(path, make(), {})
     return unpack(map_tensors(path)[0])
 
