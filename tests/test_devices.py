@@ -77,6 +77,7 @@ def test_tensors_that_are_there_do_not_move():
 )
 def test_auto_is_cuda_for_data_on_the_cpu(monkeypatch, has_cuda, home, found):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: has_cuda)
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: has_cuda)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 3)
     assert chosen_device("auto", home) == torch.device(found)
 

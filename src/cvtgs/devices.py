@@ -94,7 +94,8 @@ def chosen_device(device: str | torch.device, home: str | torch.device = "cpu") 
         return named
     home = torch.device(home)
     if home.type == "cpu" and torch.cuda.is_available():
-        return torch.device(f"cuda:{torch.cuda.current_device()}")
+        number = torch.cuda.current_device() if torch.cuda.is_initialized() else 0
+        return torch.device(f"cuda:{number}")  # starts nothing, so the process can still fork
     return home if _has_float64(home) else HOST
 
 
@@ -181,8 +182,10 @@ def within_memory(
         token = _SHORT_CHUNKS.set(is_short)
         try:
             return compute(device, note)
-        except (RuntimeError, OutOfMemoryError) as error:  # the latter of `render`
-            if device.type == "cpu" or not is_out_of_memory(error):
+        except (RuntimeError, OutOfMemoryError) as error:
+            cause = error.__cause__ if isinstance(error, OutOfMemoryError) else error  # of `render`
+            is_full = isinstance(cause, RuntimeError) and is_out_of_memory(cause)
+            if device.type == "cpu" or not is_full:
                 raise
         finally:
             _SHORT_CHUNKS.reset(token)

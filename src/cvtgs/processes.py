@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing import current_process, get_context
 from types import TracebackType
 from typing import Protocol, Self, TypeVar, runtime_checkable
@@ -95,11 +96,12 @@ class LocalWorkers:
         context = get_context("spawn")  # fork would copy locks that torch's threads hold
         self._watched, self._alive = context.Pipe(duplex=False)
         threads = max(1, core_count() // self._count)
-        self._pool = ProcessPoolExecutor(
-            self._count, context, initializer=_begin, initargs=(self._watched, threads)
-        )
-        # They start while this process reads the sample.
-        self._starts = [self._pool.submit(os.getpid) for _ in range(self._count)]
+        with _hangup_ignored():
+            self._pool = ProcessPoolExecutor(
+                self._count, context, initializer=_begin, initargs=(self._watched, threads)
+            )
+            # They start while this process reads the sample.
+            self._starts = [self._pool.submit(os.getpid) for _ in range(self._count)]
         return self
 
     def __exit__(
@@ -154,6 +156,19 @@ class LocalWorkers:
         finally:
             for future in futures:
                 future.cancel()
+
+
+@contextmanager
+def _hangup_ignored() -> Iterator[None]:
+    """Start processes that ignore the signal of a closed terminal: they end with this one."""
+    if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def _call(work: bytes) -> bytes:

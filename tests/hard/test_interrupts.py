@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import sys
 import warnings
 from collections.abc import Callable
@@ -159,3 +160,30 @@ def test_a_closed_terminal_ends_a_run_unless_nohup_started_it(before, monkeypatc
     finally:
         signal.signal(signal.SIGHUP, original)
     assert capsys.readouterr() == ("", "")
+
+
+HANGUP = """
+import os, signal, sys, time
+from cvtgs.processes import LocalWorkers
+
+def stop(number, frame):
+    sys.exit(129)
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGHUP, stop)
+    with LocalWorkers(2) as workers:
+        list(workers(abs, [1, 2]))  # both have started
+        os.killpg(0, signal.SIGHUP)
+        time.sleep(20)
+"""
+
+
+@pytest.mark.slow
+def test_a_closed_terminal_leaves_the_end_of_workers_to_their_parent(tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(HANGUP)
+    done = subprocess.run(
+        [sys.executable, program],
+        capture_output=True, text=True, check=False, start_new_session=True, timeout=120,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (129, "")

@@ -47,7 +47,7 @@ def test_images_and_gradients(dtype):
         torch.testing.assert_close(one, same, **CLOSE[dtype])
 
 
-@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
 @pytest.mark.parametrize("name", ["sh0", "shN"])
 def test_colors_that_are_not_finite_are_not_rendered(name, value):
     scene, cameras = random_scene(40, degree=1), around()

@@ -8,7 +8,7 @@ import torch
 import cvtgs.synthetic
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.rendering import projection, render
+from cvtgs.rendering import contributions, projection, render
 from render_cases import BACKENDS, MIP, backends
 from scenes import random_scene
 
@@ -161,6 +161,29 @@ def test_needles_that_vanish_when_compensated_have_finite_gradients() -> None:
     (gradient,) = torch.autograd.grad(survival.sum(), axes)
     assert 0.0 < survival.item() < 1 / 255
     assert not gradient.any()
+
+
+@backends
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("name", ["sh0", "shN"])
+def test_colors_that_are_not_finite_count_for_no_gradient(backend, name, value):
+    scene = random_scene(30, seed=1, degree=1, dtype=torch.float64)
+    poisoned = scene.tensors()[name].clone()
+    poisoned[::3] = value
+    is_kept = torch.arange(30) % 3 != 0
+    leaf = scene.means.clone().requires_grad_()
+    scene = scene.with_tensors({name: poisoned, "means": leaf}, {})
+    render(scene, TWO, backend=backend).rgb.sum().backward()
+    assert leaf.grad.isfinite().all()
+    assert not leaf.grad[~is_kept].any()
+    alone = leaf.detach()[is_kept].requires_grad_()
+    render(
+        scene[is_kept].with_tensors({"means": alone}, {}), TWO, backend=backend
+    ).rgb.sum().backward()
+    torch.testing.assert_close(leaf.grad[is_kept], alone.grad)
+    seen = contributions(scene, TWO, backend=backend)
+    if name == "sh0":
+        assert not seen[~is_kept].any()
 
 
 @backends

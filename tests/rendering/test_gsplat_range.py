@@ -45,7 +45,8 @@ def test_scenes_of_any_size_are_drawn(scale):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("sh0", torch.nan), ("sh0", torch.inf), ("shN", torch.nan)]
+    ("name", "value"),
+    [("sh0", torch.nan), ("sh0", torch.inf), ("sh0", -torch.inf), ("shN", torch.nan)],
 )
 def test_colors_that_are_not_finite_are_not_drawn(name, value):
     scene, cameras = random_scene(40, degree=1), around(2)

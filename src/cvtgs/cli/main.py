@@ -71,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _stop_signals() -> list[signal.Signals]:
-    """Return the signals that end a run: that of a closed terminal only if nohup leaves it on."""
+    """Return the signals that end a run; SIGHUP only by its default, which nohup changes."""
     numbers = [signal.SIGINT, signal.SIGTERM]
     if sys.platform != "win32" and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
         numbers.append(signal.SIGHUP)

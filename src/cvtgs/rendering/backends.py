@@ -132,9 +132,11 @@ def differentiable_once(scene: GaussianScene) -> GaussianScene:
 
     Backends compute gradients without a graph: second derivatives would be 0, or lack a part.
     """
+    if not torch.is_grad_enabled():
+        return scene
     leaves = {name: tensor for name, tensor in scene.tensors().items() if tensor.requires_grad}
     guarded = {name: _Once.apply(tensor) for name, tensor in leaves.items()}  # type: ignore[no-untyped-call]
-    return scene.with_tensors(guarded, {}) if guarded and torch.is_grad_enabled() else scene
+    return scene.with_tensors(guarded, {}) if guarded else scene
 
 
 class _Once(torch.autograd.Function):

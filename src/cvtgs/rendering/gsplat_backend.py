@@ -171,7 +171,7 @@ def _rasterize_all(
     """Return sums of colours and depths, and alpha; all cameras treat tags and pixels alike."""
     means, viewmats, intrinsics = _about_cameras(scene, cameras)
     is_compensated = scene.antialiased and not any(cameras.ignores_tag)
-    coefficients = torch.cat([scene.sh0, scene.shN], dim=1)
+    coefficients = torch.cat([scene.sh0, scene.shN[:, : REST_COUNTS[sh_degree]]], dim=1)
     is_drawn = coefficients.isfinite().flatten(1).all(dim=1)
     layers, alpha, _ = import_module("gsplat").rasterization(
         means=means.float(),

@@ -10,15 +10,7 @@ import math
 import numpy as np
 
 from cvtgs.math.parameters import MIN_ALPHA
-from cvtgs.rendering.compiled import (
-    Array,
-    Ints,
-    PixelBox,
-    TileArrays,
-    parallel,
-    prange,
-    serial,
-)
+from cvtgs.rendering.compiled import Array, Ints, PixelBox, TileArrays, parallel, prange, serial
 from cvtgs.rendering.kernels_tiles import LOG_MIN_ALPHA, box_of, span, tile_at
 from cvtgs.rendering.projection import MAX_ALPHA, MIN_TRANSMITTANCE
 
@@ -173,7 +165,8 @@ def composite_all_gradient(
     """Write the gradient by the packed splat of every intersection, in splat order.
 
     ``state`` holds for each pixel the transmittance in front of these splats (0 where finished) and
-    the gradient times all light from these splats and behind them, and ``open_rows`` as above.
+    the gradient times all light from these splats and behind them, and ``open_rows`` as in
+    `composite_all`.
     """
     starts, lists, side = tiles
     transmittance, behind, open_rows = state

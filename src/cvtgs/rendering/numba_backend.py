@@ -62,7 +62,7 @@ def rasterize(
     Memory per image: ``11 n`` numbers for n Gaussians, ``12 p`` bytes for p intersections of splats
     and tiles, and the image. The backward pass needs ``10 p`` numbers at a time. Where a scene has
     more than four million intersections, its splats are blended in parts, front to back; tiles that
-    are opaque by then are left out.
+    are opaque by then are left out of later lists.
     """
     tensors = [tensor.contiguous() for tensor in scene.tensors().values()]
     pinholes = to_pinholes(cameras)
@@ -94,7 +94,7 @@ def observe(
         settings = _settings(pinhole, sh_degree, scene)
         found = np.zeros(len(scene))
         image, open_rows = _start_image(settings, gaussians.means.dtype)
-        for splats in _parts(_project(gaussians, settings)):
+        for splats in _parts(_project(gaussians, settings), open_rows):
             tiles, weights = _list_splats(splats, open_rows, settings), np.zeros(splats.starts[-1])
             composite_all(splats.packed, tiles, _pixel_centers(image), image, open_rows, weights)
             sums = np.concatenate([[0.0], np.cumsum(weights)])[splats.starts]
@@ -127,15 +127,15 @@ class _Render(torch.autograd.Function):
     def forward(ctx: Any, settings: RasterSettings, *tensors: Tensor) -> Float[Tensor, "h w 5"]:
         gaussians = GaussianArrays(*(tensor.detach().numpy() for tensor in tensors))
         image, open_rows = _start_image(settings, gaussians.means.dtype)
-        projected, tiles = _project(gaussians, settings), None
-        for splats in _parts(projected):
+        projected, kept = _project(gaussians, settings), None
+        for splats in _parts(projected, open_rows):
             tiles = _list_splats(splats, open_rows, settings)
             centers, no_weights = _pixel_centers(image), np.empty(0)
             composite_all(splats.packed, tiles, centers, image, open_rows, no_weights)
+            kept = tiles if len(splats.rows) == len(projected.rows) else None
         result = torch.from_numpy(image)
         ctx.save_for_backward(result, *tensors)
-        ctx.settings, ctx.splats = settings, projected
-        ctx.tiles = tiles if projected.starts[-1] <= INTERSECTIONS else None
+        ctx.settings, ctx.splats, ctx.tiles = settings, projected, kept
         return result
 
     @staticmethod
@@ -148,7 +148,7 @@ class _Render(torch.autograd.Function):
         behind = np.empty_like(image[..., 0])
         light_of_gradient(image, image_grad, behind)
         state = (np.ones_like(behind), behind, open_rows)
-        for splats in _parts(ctx.splats):
+        for splats in _parts(ctx.splats, open_rows):
             tiles = ctx.tiles or _list_splats(splats, open_rows, ctx.settings)
             per_intersection = np.zeros((splats.starts[-1], 10), image.dtype)
             composite_all_gradient(
@@ -192,10 +192,13 @@ def _project(gaussians: GaussianArrays, settings: RasterSettings) -> SplatArrays
     return SplatArrays(rows, starts, first, packed)
 
 
-def _parts(splats: SplatArrays) -> Iterator[SplatArrays]:
-    """Split splats, front to back, into parts of at most ``INTERSECTIONS`` or of one splat."""
+def _parts(splats: SplatArrays, open_rows: NDArray[np.int64]) -> Iterator[SplatArrays]:
+    """Split splats, front to back, into parts of at most ``INTERSECTIONS`` or of one splat.
+
+    There are no more once all pixels are finished.
+    """
     begin, count = 0, len(splats.rows)
-    while begin < count:
+    while begin < count and open_rows.any():
         limit = splats.starts[begin] + INTERSECTIONS
         end = max(begin + 1, int(np.searchsorted(splats.starts, limit, side="right")) - 1)
         starts = splats.starts[begin : end + 1] - splats.starts[begin]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -195,12 +195,10 @@ def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
     slopes = local[:, :2] / local[:, 2:]
     centers = slopes * beside.focal + beside.principal
     order = _front_to_back(centers, ellipses, opacities, _depths(means, beside), camera)
-    colors = _colors(scene, rows[order], offsets[order], sh_degree)
-    finite = colors.isfinite().all(dim=1)
+    colors, finite = _colors(scene, rows[order], offsets[order], sh_degree)
     opacities = opacities[order]
     if colors.device.type != "cpu":  # the host would wait to learn how many are left
         opacities = torch.where(finite, opacities, 0)
-        colors = torch.where(finite[:, None], colors, 0)
     elif not bool(finite.all()):
         order, opacities, colors = order[finite], opacities[finite], colors[finite]
     return Splats(
@@ -313,15 +311,19 @@ def _front_to_back(
     return touching[torch.sort(depths[touching], stable=True).indices]
 
 
-def _colors(scene: GaussianScene, rows: Tensor, offsets: Tensor, sh_degree: int) -> Tensor:
-    sh0 = scene.sh0.index_select(0, rows)
+def _colors(
+    scene: GaussianScene, rows: Tensor, offsets: Tensor, sh_degree: int
+) -> tuple[Float[Tensor, "m 3"], Bool[Tensor, "m"]]:
+    """Return the colours, and whether they are finite; else they are black, without gradient."""
     count = spherical_harmonics.REST_COUNTS[sh_degree]
-    if not count:
-        return spherical_harmonics.evaluate(sh0, scene.shN.new_zeros(len(rows), 0, 3), offsets)
+    parts = scene.sh0.index_select(0, rows), scene.shN[:, :count].index_select(0, rows)
+    finite = torch.cat(parts, dim=1).isfinite().flatten(1).all(dim=1)
+    sh0, shN = (part.where(finite[:, None, None], 0) for part in parts)  # noqa: N806
     # In float32, squares of more than 1e19 units are infinite.
-    directions = torch.nn.functional.normalize(offsets.double(), dim=1).to(offsets.dtype)
-    shN = scene.shN[:, :count].index_select(0, rows)  # noqa: N806
-    return spherical_harmonics.evaluate(sh0, shN, directions)
+    exact = torch.nn.functional.normalize(offsets.double(), dim=1) if count else offsets
+    colors = spherical_harmonics.evaluate(sh0, shN, exact.to(offsets.dtype))
+    is_small = colors.isfinite().all(dim=1)
+    return colors.where(is_small[:, None], 0), finite & is_small
 
 
 def warn_of_near_plane(scene: GaussianScene, cameras: Sequence[Cameras], *, name: str) -> None:

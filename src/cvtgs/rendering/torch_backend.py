@@ -86,7 +86,8 @@ def contributions(scene: GaussianScene, cameras: Cameras) -> Iterator[Float[Tens
     for camera in cameras.singles():
         with torch.inference_mode(mode=False), torch.enable_grad():
             # Mid-grey, so that no colour is clipped; the higher SH bands do not matter here.
-            sh0 = torch.zeros_like(scene.sh0).requires_grad_()
+            # Colours that are not finite stay so, since they are not rendered.
+            sh0 = (0 * tensors["sh0"]).requires_grad_()
             gray = scene.with_tensors(tensors | {"sh0": sh0, "shN": tensors["shN"][:, :0]}, {})
             image = rasterize(gray, camera, sh_degree=0).rgb
             (gradient,) = torch.autograd.grad(image[..., 0].sum(), sh0)
