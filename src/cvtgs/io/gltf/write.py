@@ -42,6 +42,7 @@ from cvtgs.scene import GaussianScene
 
 _CHUNK_ROWS = 1 << 18
 _ARRAY_BUFFER = 34962
+_DATA = "data:application/octet-stream;base64,"
 _SPZ_VERSION: Final = 3  # the newest version that readers of the draft of the extension accept
 
 
@@ -78,11 +79,17 @@ def write_gltf(scene: GaussianScene, file: BinaryIO) -> None:
     arrays = arrays_of(scene)
     attributes, count = _attributes(arrays), len(arrays.means)
     document = _document(scene, arrays, attributes)
-    content = b"".join(part for one in attributes for part in one.parts(count))
-    text = base64.b64encode(content).decode()
-    uri = f"data:application/octet-stream;base64,{text}"
-    document["buffers"] = [{"byteLength": len(content), "uri": uri}]
-    file.write(json_bytes(document))
+    buffer = {"byteLength": count * sum(one.row_bytes for one in attributes), "uri": _DATA}
+    # Numbers are encoded as they are written: as one text, they would be in memory several times.
+    start, end = json_bytes(document | {"buffers": [buffer]})[:-4], b'"}]}'
+    file.write(start)
+    rest = b""
+    for part in (part for one in attributes for part in one.parts(count)):
+        rest += part
+        whole = len(rest) // 3 * 3  # bytes that need no padding
+        file.write(base64.b64encode(rest[:whole]))
+        rest = rest[whole:]
+    file.write(base64.b64encode(rest) + end)
 
 
 def write_spz_glb(scene: GaussianScene, file: BinaryIO) -> None:
