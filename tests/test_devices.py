@@ -18,6 +18,7 @@ from cvtgs.devices import (
     within_memory,
 )
 from cvtgs.errors import DeviceError, OutOfMemoryError, memory_errors
+from cvtgs.rendering import choose_backend
 from pretended_device import pretended_cuda
 
 
@@ -104,6 +105,24 @@ def test_images_that_do_not_fit_lead_to_the_cpu_as_well():
 
     note = within_memory(compute, torch.device("meta"), work="a test", may_leave=True)
     assert note == "meta ran out of memory; computed on the CPU"
+
+
+def test_a_full_host_leads_nowhere():
+    tried = []
+
+    def compute(device: torch.device, note: str) -> None:
+        tried.append(device)
+        with memory_errors("rendering", "render fewer"):
+            raise MemoryError
+
+    with pytest.raises(OutOfMemoryError, match="rendering needs more memory"):
+        within_memory(compute, torch.device("meta"), work="a test", may_leave=True)
+    assert len(tried) == 1
+
+
+def test_images_need_a_device_with_float64():
+    with pytest.raises(DeviceError, match=r"^device 'mps' cannot be used here: it has no float64"):
+        choose_backend("torch", torch.device("mps"))
 
 
 @pytest.mark.parametrize("may_leave", [True, False])

@@ -285,8 +285,10 @@ def test_a_new_file_waits_for_a_scanner_on_disks_without_links(
     monkeypatch.setattr(atomic, "_WINDOWS", True)
     monkeypatch.setattr(atomic, "_WAITS", (0.0, 0.0))
     monkeypatch.setattr(os, "link", refuse)
-    monkeypatch.setattr(os, "rename", held_once(os.rename) if links == "refused" else refuse)
-    monkeypatch.setattr(os, "replace", held_once(os.replace))
+    calls = os.rename, os.replace
+    renames = links == "refused"
+    monkeypatch.setattr(os, "rename", held_once(calls[0]) if renames else refuse)
+    monkeypatch.setattr(os, "replace", refuse if renames else held_once(calls[1]))
     with atomic.atomic_output(tmp_path / "a.txt") as file:
         file.write(b"whole")
     assert (tmp_path / "a.txt").read_bytes() == b"whole"

@@ -26,6 +26,7 @@ from cvtgs.errors import (
     OutputError,
 )
 from cvtgs.io import losses, to_dict
+from cvtgs.io.atomic import replace_file
 from format_cases import storable_scene
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
 from scenes import same_bits
@@ -364,3 +365,15 @@ def test_a_full_disk_behind_a_stream_is_named() -> None:
 
     with pytest.raises(OutputError, match=r"must be open .* take all bytes, found: no space left"):
         cvtgs.save(storable_scene(3, degree=0), Full(), format=".ply")
+
+
+def test_the_copy_of_a_stream_gets_its_name_by_a_move_that_waits_on_windows(monkeypatch):
+    moved = []
+
+    def move(source, target):
+        moved.append(target.name)
+        replace_file(source, target)
+
+    monkeypatch.setattr("cvtgs.io.streams.replace_file", move)
+    assert len(cvtgs.load(io.BytesIO(GOOD))) == 3
+    assert moved == ["stream.ply"]

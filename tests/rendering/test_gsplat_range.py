@@ -52,7 +52,8 @@ def test_colors_that_are_not_finite_are_not_drawn(name, value):
     scene, cameras = random_scene(40, degree=1), around(2)
     poisoned = scene.tensors()[name].clone()
     poisoned[::5] = value
-    scene = scene.with_tensors({name: poisoned}, {})
+    leaf = scene.means.clone().requires_grad_()
+    scene = scene.with_tensors({name: poisoned, "means": leaf}, {})
     found, wanted = (
         backend.rasterize(scene, cameras, sh_degree=1)
         for backend in (gsplat_backend, torch_backend)
@@ -60,6 +61,9 @@ def test_colors_that_are_not_finite_are_not_drawn(name, value):
     assert wanted.rgb.isfinite().all()
     torch.testing.assert_close(found.rgb, wanted.rgb, rtol=0, atol=1e-3)
     torch.testing.assert_close(found.alpha, wanted.alpha, rtol=0, atol=1e-3)
+    found.rgb.sum().backward()
+    assert leaf.grad.isfinite().all()
+    assert not leaf.grad[::5].any()
 
 
 def test_a_camera_far_away_does_not_blur_the_images_of_others():

@@ -80,6 +80,18 @@ def test_later_parts_leave_out_finished_tiles(listed, monkeypatch):
     assert sum(kept for _, kept in opaque) < 0.8 * sum(count for count, _ in opaque)
 
 
+def test_parts_end_with_the_last_open_pixel(listed, monkeypatch):
+    scene = scene_of(8.0)
+    wide = scene.with_tensors({"log_scales": scene.log_scales + 3}, {})
+    (camera, _) = VIEWS.singles()
+    whole = render(wide, camera, backend="numba")
+    ((total, _),) = listed
+    listed.clear()
+    monkeypatch.setattr(numba_backend, "INTERSECTIONS", 100)
+    assert torch.equal(render(wide, camera, backend="numba").rgb, whole.rgb)
+    assert sum(count for count, _ in listed) < 0.5 * total
+
+
 def test_a_scene_out_of_sight_has_no_parts(listed):
     scene = scene_of(0.0)
     (camera, _) = VIEWS.singles()

@@ -20,6 +20,20 @@ def files_of(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def test_a_new_stream_is_published_by_a_move_that_waits_on_windows(
+    plan: StreamPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved: list[Path] = []
+
+    def move(source: Path, target: Path) -> None:
+        moved.append(target)
+        replace_file(source, target)
+
+    monkeypatch.setattr("cvtgs.streams.files.replace_file", move)
+    write_sog_stream(plan, tmp_path / "out")
+    assert moved == [tmp_path / "out"]
+
+
 @pytest.mark.parametrize("number", range(6))
 def test_an_interrupted_replacement_keeps_the_old_stream(
     plan: StreamPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
