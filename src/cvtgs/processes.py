@@ -161,8 +161,9 @@ class LocalWorkers:
 @contextmanager
 def _hangup_ignored() -> Iterator[None]:
     """Start processes that ignore the signal of a closed terminal: they end with this one."""
-    if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
-        yield
+    is_main = threading.current_thread() is threading.main_thread()  # others set no handlers
+    if sys.platform == "win32" or not is_main or signal.getsignal(signal.SIGHUP) is None:
+        yield  # None is a handler of a program around Python, which could not be restored
         return
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:

@@ -18,6 +18,7 @@ from cvtgs.cli.main import main
 from cvtgs.errors import OutputError
 from cvtgs.io import atomic_output
 from cvtgs.io.tensors import save_tensors
+from cvtgs.processes import _hangup_ignored
 from hard_cases import CASES
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
@@ -187,3 +188,13 @@ def test_a_closed_terminal_leaves_the_end_of_workers_to_their_parent(tmp_path):
         capture_output=True, text=True, check=False, start_new_session=True, timeout=120,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (129, "")
+
+
+def test_the_handler_of_a_program_around_python_stays(monkeypatch):
+    monkeypatch.setattr(signal, "getsignal", lambda number: None)
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        with _hangup_ignored():
+            assert signal.signal(signal.SIGHUP, signal.SIG_DFL) == signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGHUP, before)
