@@ -26,7 +26,7 @@ from cvtgs.rendering.backends import (
     observe_in_two_passes,
     without_gradients,
 )
-from cvtgs.rendering.projection import DILATION, to_matrices
+from cvtgs.rendering.projection import DILATION, rows_are_finite, to_matrices
 from cvtgs.scene import GaussianScene
 
 TOGETHER = 1 << 22
@@ -171,14 +171,15 @@ def _rasterize_all(
     """Return sums of colours and depths, and alpha; all cameras treat tags and pixels alike."""
     means, viewmats, intrinsics = _about_cameras(scene, cameras)
     is_compensated = scene.antialiased and not any(cameras.ignores_tag)
-    coefficients = torch.cat([scene.sh0, scene.shN[:, : REST_COUNTS[sh_degree]]], dim=1)
-    is_drawn = coefficients.isfinite().flatten(1).all(dim=1)
+    is_drawn = rows_are_finite(scene.sh0, scene.shN[:, : REST_COUNTS[sh_degree]])
+    if means.requires_grad:  # which colours of Gaussians that are not drawn would make NaN
+        colors = colors.where(colors.isfinite(), 0)
     layers, alpha, _ = import_module("gsplat").rasterization(
         means=means.float(),
         quats=scene.quats.float(),
         scales=scene.scales.float(),
         opacities=scene.opacities.where(is_drawn, 0).float(),
-        colors=colors.where(colors.isfinite(), 0).float(),
+        colors=colors.float(),
         viewmats=viewmats,
         Ks=intrinsics,
         width=cameras.width,

@@ -317,13 +317,18 @@ def _colors(
     """Return the colours, and whether they are finite; else they are black, without gradient."""
     count = spherical_harmonics.REST_COUNTS[sh_degree]
     parts = scene.sh0.index_select(0, rows), scene.shN[:, :count].index_select(0, rows)
-    finite = torch.cat(parts, dim=1).isfinite().flatten(1).all(dim=1)
+    finite = rows_are_finite(*parts)
     sh0, shN = (part.where(finite[:, None, None], 0) for part in parts)  # noqa: N806
     # In float32, squares of more than 1e19 units are infinite.
     exact = torch.nn.functional.normalize(offsets.double(), dim=1) if count else offsets
     colors = spherical_harmonics.evaluate(sh0, shN, exact.to(offsets.dtype))
-    is_small = colors.isfinite().all(dim=1)
+    is_small = rows_are_finite(colors)
     return colors.where(is_small[:, None], 0), finite & is_small
+
+
+def rows_are_finite(*parts: Float[Tensor, "m ..."]) -> Bool[Tensor, "m"]:
+    """Return for each row whether all of its numbers are finite; nothing waits for a device."""
+    return torch.stack([part.isfinite().flatten(1).all(dim=1) for part in parts]).all(dim=0)
 
 
 def warn_of_near_plane(scene: GaussianScene, cameras: Sequence[Cameras], *, name: str) -> None:
