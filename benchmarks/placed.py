@@ -52,7 +52,7 @@ def placed(thing: GaussianScene, ground: GaussianScene, *, seed: int) -> Gaussia
     piece = upright(cut_block(ground, GROUND, seed=seed), radius=GROUND_RADIUS, level=0.5)
     center = upright(thing, radius=OBJECT_RADIUS, level=0.98)
     rest = far_surroundings(SURROUNDINGS, from_radius=GROUND_RADIUS, seed=seed)
-    return edit.merge([without_tag(scene) for scene in (center, piece, rest)])
+    return edit.concatenate([without_tag(scene) for scene in (center, piece, rest)], fill=True)
 
 
 def without_tag(scene: GaussianScene) -> GaussianScene:

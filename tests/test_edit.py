@@ -10,7 +10,7 @@ import torch
 import oracles
 from cvtgs import GaussianScene
 from cvtgs.boxes import Box, Sphere
-from cvtgs.edit import Motion, concatenate, crop, drop_faint, drop_large, merge, move
+from cvtgs.edit import Motion, concatenate, crop, drop_faint, drop_large, move
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
 from cvtgs.io import change_axes
 from cvtgs.math.spherical_harmonics import rotated_rest
@@ -140,37 +140,37 @@ def test_rotation_does_not_mix_sh_bands() -> None:
     torch.testing.assert_close(found.square().sum(), rest.square().sum())
 
 
-def test_merge_keeps_all_rows() -> None:
+def test_concatenation_keeps_all_rows() -> None:
     first, second = labelled(4, degree=2), labelled(3, seed=1, degree=2)
-    both = merge([first, second])
+    both = concatenate([first, second], fill=True)
     assert same_bits(both[:4], first)
     assert same_bits(both[4:], second)
     assert both.comments == ("kept",)
-    assert same_bits(merge([first]), first)
+    assert same_bits(concatenate([first], fill=True), first)
 
 
-def test_merge_widens_unlike_scenes_and_warns() -> None:
+def test_unlike_scenes_are_filled_with_a_warning() -> None:
     first = replace(labelled(4, degree=0), comments=("SplatRenderMode: mip",))
     second = random_scene(3, degree=3, dtype=torch.float64)
-    with pytest.warns(UserWarning, match="of the scenes to") as said:
-        both = merge([first, second])
+    with pytest.warns(UserWarning, match="of the scenes") as said:
+        both = concatenate([first, second], fill=True)
     assert [one.category for one in said] == [DroppedDataWarning, UserWarning]
     assert [str(one.message) for one in said] == [
-        "left out column 'label', which not all of the scenes to merge have.",
-        "some of the scenes to join are tagged SplatRenderMode: mip and others are not; viewers "
-        "will show one of the two kinds too soft or too sharp.",
+        "left out column 'label', which not all of the scenes have.",
+        "some of the scenes to concatenate are tagged SplatRenderMode: mip and others are not; "
+        "viewers will show one of the two kinds too soft or too sharp.",
     ]
     assert {one.filename for one in said} == {__file__}
     assert (both.sh_degree, both.dtype, dict(both.extras)) == (3, torch.float64, {})
     assert torch.equal(both.means[:4].float(), first.means)
     assert not both.shN[:4].any()
     assert torch.equal(both.shN[4:], second.shN)
-    with pytest.raises(InvalidSceneError, match=r"merging needs at least one scene, found \[\]"):
-        merge([])
+    with pytest.raises(InvalidSceneError, match=r"needs at least one scene, found \[\]"):
+        concatenate([], fill=True)
     with pytest.raises(InvalidSceneError, match=r"at least one scene, found \['a.ply'\]"):
-        merge(["a.ply"])
+        concatenate(["a.ply"], fill=True)
     with pytest.raises(InvalidSceneError, match="at least one scene, found None"):
-        merge(None)
+        concatenate(None, fill=True)
 
 
 @pytest.mark.parametrize(
@@ -226,11 +226,11 @@ def test_normals_turn_with_the_scene() -> None:
     assert quarter.extras["nz"].tolist() == [0.0, -2.0]
 
 
-def test_missing_normals_are_zeros_when_scenes_merge() -> None:
+def test_missing_normals_are_filled_with_zeros() -> None:
     first = with_normals(random_scene(2), torch.ones(2, 3))
-    both = merge([first, random_scene(3)])
+    both = concatenate([first, random_scene(3)], fill=True)
     assert [both.extras[name].tolist() for name in NORMALS] == [[1.0, 1, 0, 0, 0]] * 3
-    assert not merge([random_scene(2), random_scene(3)]).extras
+    assert not concatenate([random_scene(2), random_scene(3)], fill=True).extras
 
 
 def test_the_third_of_two_scales_marks_flat_gaussians_at_every_size() -> None:
@@ -263,34 +263,35 @@ def test_numbers_of_any_type_make_a_motion():
     assert len(crop(scene, Sphere(center=torch.zeros(3), radius=1e6))) == 5
 
 
-def test_scenes_to_merge_may_come_from_an_iterator():
+def test_scenes_to_concatenate_may_come_from_an_iterator():
     scenes = [random_scene(2), random_scene(3)]
-    assert same_bits(merge(iter(scenes)), merge(scenes))
+    assert same_bits(concatenate(iter(scenes), fill=True), concatenate(scenes, fill=True))
 
 
-def test_merged_scenes_keep_their_sh_bands_and_get_zeros_above() -> None:
+def test_filled_scenes_keep_their_sh_bands_and_get_zeros_above() -> None:
     first, second = random_scene(3, degree=1), random_scene(2, degree=2)
-    both = merge([first, second])
+    both = concatenate([first, second], fill=True)
     assert torch.equal(both.shN[:3, :3], first.shN)
     assert not both.shN[:3, 3:].any()
     assert torch.equal(both.shN[3:], second.shN)
 
 
-@pytest.mark.parametrize("join", [merge, concatenate])
-def test_joined_columns_of_floats_and_integers_keep_large_integers(join) -> None:
+@pytest.mark.parametrize("fill", [False, True])
+def test_joined_columns_of_floats_and_integers_keep_large_integers(fill) -> None:
     """float32, to which torch would promote them, has no odd numbers above 2 ** 24."""
     ids = torch.tensor([2**24 + 1, 7])
     first = replace(random_scene(2), extras={"id": ids, "kind": ids.to(torch.uint8)})
     second = replace(random_scene(1), extras={"id": torch.tensor([0.1]), "kind": ids[:1]})
-    joined = join([first, second]).extras
+    joined = concatenate([first, second], fill=fill).extras
     assert joined["id"].tolist() == [2**24 + 1, 7, torch.tensor(0.1).item()]
     assert joined["kind"].dtype == torch.int64
 
 
-def test_scenes_of_several_layouts_merge_to_one_of_none() -> None:
+def test_scenes_of_several_layouts_become_one_of_none() -> None:
     """Else a layout without a third scale would drop those of the other scene."""
     flat = replace(random_scene(3), layout=(("scale_0", "float"), ("scale_1", "float")))
     thick = replace(random_scene(2), layout=(*flat.layout, ("scale_2", "float")))
     for scenes in ([flat, thick], [thick, flat]):
-        assert (merge(scenes).layout, merge(scenes).has_two_scales) == ((), False)
-    assert merge([flat, flat]).layout == flat.layout
+        both = concatenate(scenes, fill=True)
+        assert (both.layout, both.has_two_scales) == ((), False)
+    assert concatenate([flat, flat], fill=True).layout == flat.layout

@@ -359,7 +359,7 @@ def test_scenes_that_do_not_match_are_not_joined():
 def test_joining_tagged_and_other_scenes_warns():
     scene = random_scene(3)
     tagged = replace(scene, comments=("SplatRenderMode: mip",))
-    with pytest.warns(UserWarning, match="some of the scenes to join are tagged SplatRenderMode"):
+    with pytest.warns(UserWarning, match="some of the scenes to concatenate are tagged"):
         cvtgs.concatenate([scene, tagged])
 
 
@@ -385,9 +385,7 @@ def test_with_tensors_takes_keywords_and_keeps_extras():
 
 def test_scenes_on_two_devices_are_not_joined():
     scene = random_scene(3)
-    with pytest.raises(
-        InvalidSceneError, match="joining needs scenes on one device, found cpu, meta"
-    ):
+    with pytest.raises(InvalidSceneError, match="concatenate needs one device, found cpu, meta"):
         cvtgs.concatenate([scene, scene.to("meta")])
 
 

@@ -1,4 +1,4 @@
-"""Edits of scenes: crop, drop, move and merge. Unaffected values stay bit-identical."""
+"""Edits of scenes: crop, drop, move and concatenate. Unaffected values stay bit-identical."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,11 +14,11 @@ from cvtgs.devices import without_autocast
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError, warn
 from cvtgs.math.parameters import multiply_quats, rotation_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS, rotated_rest
-from cvtgs.scene import NORMALS, GaussianScene, checked_scenes
+from cvtgs.scene import NORMALS, GaussianScene
 from cvtgs.tags import TWO_SCALES
 from cvtgs.text import shown
 
-__all__ = ["Motion", "concatenate", "crop", "drop_faint", "drop_large", "merge", "move"]
+__all__ = ["Motion", "concatenate", "crop", "drop_faint", "drop_large", "move"]
 
 _NO_TURN = (1.0, 0.0, 0.0, 0.0)
 _NO_SHIFT = (0.0, 0.0, 0.0)
@@ -255,88 +255,90 @@ def turned_normals(extras: Mapping[str, Tensor], matrix: Tensor) -> dict[str, Te
     return {**extras, **columns}
 
 
-def merge(scenes: Iterable[GaussianScene]) -> GaussianScene:
-    """Return the Gaussians of several scenes as one scene; degrees and dtypes may differ.
+def concatenate(scenes: Iterable[GaussianScene], *, fill: bool = False) -> GaussianScene:
+    """Return the Gaussians of several scenes as one scene.
 
-    Missing SH bands and normals are filled with zeros, and the result is float64 if any scene is.
-    Other extra columns that a scene lacks are dropped with a warning. If only some scenes were
-    trained with anti-aliasing, viewers cannot show all of them correctly, so a warning says so.
+    A warning says if only some scenes were trained with anti-aliasing, since viewers cannot show
+    all of them correctly.
 
     Args:
-        scenes: At least one, all on one device.
+        scenes: At least one, all on one device. Without ``fill``, they must have the same SH
+            degree, number of scales, dtype and extra columns.
+        fill: Whether missing SH bands and normals are filled with zeros; the result is float64 if
+            any scene is. Other extra columns that a scene lacks are left out, with a warning.
 
     Returns:
-        All Gaussians, in the order of the scenes, with all comments.
+        All Gaussians, in the order of the scenes, with all comments; the layout is that of the
+        scenes if it is the same.
 
     Raises:
-        InvalidSceneError: There is no scene, or the scenes are on several devices.
+        InvalidSceneError: There is no scene, or the scenes do not fit together.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
-        >>> merge([make("object", 10, sh_degree=0), make("object", 5, sh_degree=2)])
+        >>> scenes = make("object", 10, sh_degree=0), make("object", 5, sh_degree=2)
+        >>> concatenate(scenes, fill=True)
         GaussianScene(15 Gaussians, SH degree 2, float32, cpu)
     """
-    scenes = checked_scenes(scenes, "merging")
+    first, *others = scenes = _listed(scenes)
+    if not others:
+        return first
+    are_flat = [scene.has_two_scales for scene in scenes]
+    parts = _filled(scenes) if fill else scenes
+    for number, part in enumerate(parts):
+        if _kind(part) != _kind(parts[0]):
+            raise InvalidSceneError(
+                f"scenes to concatenate must be alike, or filled (fill=True); the first has "
+                f"{_kind(first)}, scene {number} {_kind(part)}."
+            )
+    if any(other.antialiased != first.antialiased for other in others):
+        warn(
+            "some of the scenes to concatenate are tagged SplatRenderMode: mip and others are not; "
+            "viewers will show one of the two kinds too soft or too sharp."
+        )
+    layout = first.layout if all(other.layout == first.layout for other in others) else ()
+    comments = tuple(dict.fromkeys(line for scene in scenes for line in scene.comments))
+    if not all(are_flat):
+        comments = TWO_SCALES.removed_from(comments)
+    elif not layout and not TWO_SCALES.is_in(comments):  # then no layout says so
+        comments = (*comments, TWO_SCALES.text)
+    names, columns = first.tensors(), parts[0].extras
+    return replace(
+        first,
+        **{name: torch.cat([part.tensors()[name] for part in parts]) for name in names},
+        extras={name: _joined([part.extras[name] for part in parts]) for name in columns},
+        comments=comments,
+        layout=layout,
+    )
+
+
+def _listed(scenes: Iterable[object]) -> list[GaussianScene]:
+    """Return several scenes as a list; raise if there is none, or not all are on one device."""
+    given = list(scenes) if isinstance(scenes, Iterable) else []
+    found = [scene for scene in given if isinstance(scene, GaussianScene)]
+    if not found or len(found) < len(given):
+        raise InvalidSceneError(f"concatenate needs at least one scene, found {shown(scenes)}.")
+    devices = sorted({str(scene.device) for scene in found})
+    if len(devices) > 1:
+        raise InvalidSceneError(f"concatenate needs one device, found {', '.join(devices)}.")
+    return found
+
+
+def _filled(scenes: Sequence[GaussianScene]) -> list[GaussianScene]:
+    """Return scenes of one SH degree, dtype, number of scales and set of extra columns."""
     found = {name for scene in scenes for name in scene.extras}
     common = found.intersection(*({*scene.extras, *NORMALS} for scene in scenes))
     missing = sorted(found - common)
     if missing:
         warn(
             f"left out {'columns' if len(missing) > 1 else 'column'} "
-            f"{', '.join(map(repr, missing))}, which not all of the scenes to merge have.",
+            f"{', '.join(map(repr, missing))}, which not all of the scenes have.",
             DroppedDataWarning,
         )
     dtype = torch.float64 if any(s.dtype == torch.float64 for s in scenes) else torch.float32
     degree = max(scene.sh_degree for scene in scenes)
-    layout = scenes[0].layout if len({scene.layout for scene in scenes}) == 1 else ()
     plain = [replace(s, comments=TWO_SCALES.removed_from(s.comments), layout=()) for s in scenes]
-    alike = [_widened(scene, degree, dtype, common) for scene in plain]
-    comments = tuple(dict.fromkeys(line for scene in scenes for line in scene.comments))
-    if not all(scene.has_two_scales for scene in scenes):
-        comments = TWO_SCALES.removed_from(comments)
-    elif not layout and not TWO_SCALES.is_in(comments):  # then no layout says so
-        comments = (*comments, TWO_SCALES.text)
-    return replace(concatenate(alike), comments=comments, layout=layout)
-
-
-def concatenate(scenes: Iterable[GaussianScene]) -> GaussianScene:
-    """Return the Gaussians of several scenes as one scene.
-
-    Args:
-        scenes: At least one, of the same SH degree, number of scales, dtype, device and extra
-            columns; comments and layout are the first's. A warning says if only some are mip.
-
-    Returns:
-        All Gaussians, in the order of the scenes.
-
-    Raises:
-        InvalidSceneError: The scenes do not fit together.
-
-    Example:
-        >>> from cvtgs.synthetic import scene as make
-        >>> len(concatenate([make("object", 20, seed=0), make("object", 30, seed=1)]))
-        50
-    """
-    scenes = checked_scenes(scenes, "joining")
-    first, *others = scenes
-    if not others:
-        return first
-    for number, other in enumerate(others, start=1):
-        if _kind(other) != _kind(first):
-            raise InvalidSceneError(
-                f"scenes to join must be alike; the first has {_kind(first)}, scene {number} "
-                f"{_kind(other)}."
-            )
-    if any(other.antialiased != first.antialiased for other in others):
-        warn(
-            "some of the scenes to join are tagged SplatRenderMode: mip and others are not; "
-            "viewers will show one of the two kinds too soft or too sharp."
-        )
-    tensors = [scene.tensors() for scene in scenes]
-    return first.with_tensors(
-        {name: torch.cat([each[name] for each in tensors]) for name in tensors[0]},
-        {name: _joined([scene.extras[name] for scene in scenes]) for name in first.extras},
-    )
+    return [_widened(scene, degree, dtype, common) for scene in plain]
 
 
 def _joined(columns: list[Tensor]) -> Tensor:

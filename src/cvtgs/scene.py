@@ -1,7 +1,7 @@
 """GaussianScene: the Gaussians of a scene in stored (not activated) parameters."""
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pkgutil import resolve_name
@@ -358,15 +358,4 @@ def as_scene(scene: SceneLike, name: str = "scene") -> GaussianScene:
             f"{name} must be a GaussianScene or the path of one, found {kind}."
         )
     check_scene(found, name)
-    return found
-
-
-def checked_scenes(scenes: Any, work: str) -> list[GaussianScene]:
-    """Return several scenes as a list; raise if there is none, or not all are on one device."""
-    found = list(scenes) if isinstance(scenes, Iterable) else [scenes]
-    if not found or not all(isinstance(scene, GaussianScene) for scene in found):
-        raise InvalidSceneError(f"{work} needs at least one scene, found {shown(scenes)}.")
-    places = sorted({str(scene.device) for scene in found})
-    if len(places) > 1:
-        raise InvalidSceneError(f"{work} needs scenes on one device, found {', '.join(places)}.")
     return found

@@ -10,7 +10,7 @@ import torch
 from cvtgs import GaussianScene, load, save
 from cvtgs.boxes import Box, Sphere
 from cvtgs.cli.main import main
-from cvtgs.edit import Motion, crop, drop_faint, drop_large, merge, move
+from cvtgs.edit import Motion, concatenate, crop, drop_faint, drop_large, move
 from cvtgs.io import losses
 from cvtgs.tags import TWO_SCALES
 from format_cases import storable_scene
@@ -48,7 +48,7 @@ def test_merge_accepts_several_files_and_formats(tmp_path: Path, scene: Gaussian
     others = [load(tmp_path / "b.ply"), load(tmp_path / "c.glb")]
     names = [str(tmp_path / name) for name in ("b.ply", "c.glb")]
     found = converted(tmp_path, "--merge", names[0], "--merge", names[1])
-    assert same_bits(found, merge([scene, *others]))
+    assert same_bits(found, concatenate([scene, *others], fill=True))
     assert (len(found), found.sh_degree) == (212, 2)
 
 
@@ -57,7 +57,9 @@ def test_dropped_gaussians_and_bands_are_printed(
 ) -> None:
     words = ["--crop-sphere", "0,0,0,2", "--min-opacity", "0.5", "--sh-degree", "0"]
     found = converted(tmp_path, "--merge", str(tmp_path / "a.ply"), *words)
-    inside = crop(merge([scene, scene]), [Sphere(center=(0.0, 0.0, 0.0), radius=2.0)])
+    inside = crop(
+        concatenate([scene, scene], fill=True), [Sphere(center=(0.0, 0.0, 0.0), radius=2.0)]
+    )
     printed = " ".join(capsys.readouterr().out.split())
     assert (
         f"Lost: {400 - len(inside)} Gaussians (outside --crop-sphere); "
@@ -225,7 +227,7 @@ def test_packed_and_unpacked_sog_have_the_same_axes(tmp_path: Path, scene: Gauss
         assert main(words) == 0
         found.append(load(target))
     assert same_bits(*found)
-    assert not same_bits(found[0], merge([load(packed)] * 2))
+    assert not same_bits(found[0], concatenate([load(packed)] * 2, fill=True))
 
 
 def test_a_merged_scene_of_which_some_are_flat_loses_the_tag(

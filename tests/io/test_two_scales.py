@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from cvtgs import Simplifier, SimplifyConfig, concatenate, load, save
-from cvtgs.edit import merge
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError
 from cvtgs.scene import FLAT_LOG_SCALE
 from cvtgs.streams import plan_stream, write_sog_stream, write_tiles
@@ -47,26 +46,28 @@ def test_streams_of_flat_gaussians_have_the_tag(tmp_path: Path) -> None:
 def test_thick_gaussians_have_no_tag() -> None:
     """Other tools draw all Gaussians of a file with the tag as flat."""
     tagged = replace(flat_file(300, torch.float32), comments=(TWO_SCALES.text, "mine"), layout=())
-    both = merge([tagged, random_scene(5)])
+    both = concatenate([tagged, random_scene(5)], fill=True)
     assert both.comments == ("mine",)
-    assert merge([tagged, tagged]).has_two_scales
+    assert concatenate([tagged, tagged], fill=True).has_two_scales
     flat = replace(flat_file(300, torch.float32), comments=("mine",))
-    assert merge([flat, flat]).comments == ("mine",)  # its layout says so
+    assert concatenate([flat, flat], fill=True).comments == ("mine",)  # its layout says so
     other = replace(flat, layout=flat.layout[::-1])
-    assert merge([flat, other]).comments == ("mine", TWO_SCALES.text)
+    assert concatenate([flat, other], fill=True).comments == ("mine", TWO_SCALES.text)
     config = SimplifyConfig.from_mapping({"effects": {"flat": "off"}})
     thick = Simplifier(config=config, device="cpu").simplify(tagged, 0.1)
     assert thick.comments == ("mine",)
     assert float(thick.log_scales[:, 2].amax()) > FLAT_LOG_SCALE + 1
 
 
-def test_scenes_of_two_and_of_three_scales_are_not_joined_but_merged() -> None:
+def test_scenes_of_two_and_of_three_scales_are_only_concatenated_if_filled() -> None:
     """Joined, the thick ones would become flat in a file without a third scale."""
     flat = flat_file(30, torch.float32)
     thick = random_scene(20, degree=flat.sh_degree)
     for scenes in ([flat, thick], [thick, flat]):
-        with pytest.raises(InvalidSceneError, match="scenes to join must be alike; the first has"):
+        with pytest.raises(
+            InvalidSceneError, match="scenes to concatenate must be alike, or filled"
+        ):
             concatenate(scenes)
-        merged = merge(scenes)
+        merged = concatenate(scenes, fill=True)
         assert not merged.has_two_scales
         assert len(merged) == 50

@@ -354,7 +354,7 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
         scenes.append(cvtgs.io.load(path, axes=source, trust_sizes=options.trust_sizes))
     # What is dropped is printed below instead.
     with nullcontext() if options.quiet else without_warnings(DroppedDataWarning):
-        scene = scenes[0] if len(scenes) == 1 else cvtgs.edit.merge(scenes)
+        scene = cvtgs.concatenate(scenes, fill=True)
     left = sorted({name for one in scenes for name in one.extras} - set(scene.extras))
     scene, phrases = edited(scene, edits)
     if any(one.has_two_scales for one in scenes) and not scene.has_two_scales:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 
-from cvtgs.edit import Motion, merge, move
+from cvtgs.edit import Motion, concatenate, move
 from cvtgs.errors import DroppedDataWarning, warn
 from cvtgs.io.arrays import Arrays, log_scales_of, logits_of, scene_of, unit_quats
 from cvtgs.io.axes import SCENE_AXES, change_axes
@@ -130,7 +130,7 @@ def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False)
         read[where] = _read_primitive(file, one, trust_sizes=trust_sizes)
     for one, matrix in placed:
         scenes.append(_moved(file, read[one.where], matrix))
-    scene = scenes[0] if len(scenes) == 1 else merge(scenes)
+    scene = concatenate(scenes, fill=True)
     return change_axes(scene, AXES if axes is None else axes, SCENE_AXES)
 
 

@@ -9,7 +9,7 @@ import torch
 from pydantic import Field
 
 from cvtgs.counts import whole_number
-from cvtgs.edit import merge
+from cvtgs.edit import concatenate
 from cvtgs.errors import FileFormatError, InvalidArgumentError
 from cvtgs.io.files import (
     LONGEST_NAME,
@@ -99,7 +99,7 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
         if not trust_sizes:  # many small files
             count, degree = sum(map(len, scenes)), max(scene.sh_degree for scene in scenes)
             check_expansion(path, count=count, sh_degree=degree, stored=stored)
-    return scenes[0] if len(scenes) == 1 else merge(scenes)
+    return concatenate(scenes, fill=True)
 
 
 def _places(meta: _LodMeta, lod: int, path: Path) -> Iterator[tuple[int, _Rows]]:
