@@ -112,7 +112,8 @@ def visible_rows(
         min_opacity: Gaussians at or above this opacity always stay.
         max_mass_share: The faintest are dropped while their mass is at most this share of the
             total; of equally faint ones, the lightest are dropped first.
-        at_least: If fewer than this many would stay, the heaviest of the dropped ones stay too.
+        at_least: If fewer than this many would stay, the heaviest of the dropped ones stay too,
+            those first that images can show.
 
     Returns:
         Mask of the Gaussians that stay.
@@ -136,13 +137,13 @@ def visible_rows(
     faint = (opacities < min_opacity).nonzero()[:, 0]
     faint = faint[torch.sort(masses[faint], stable=True).indices]  # breaks ties of opacity
     faint = faint[torch.sort(opacities[faint], stable=True).indices]
-    dropped = faint
+    dropped, drawn = faint, masses.double() * drawn_rows(opacities)
     if max_mass_share < 1:
-        drawn = masses.double() * drawn_rows(opacities)
         dropped = faint[running_sums(drawn[faint]) <= max_mass_share * drawn.sum()]
     missing = at_least - (len(opacities) - len(dropped))
     if missing > 0:
-        heaviest_first = torch.sort(masses[dropped], stable=True, descending=True).indices
+        dropped = dropped[torch.sort(masses[dropped], stable=True, descending=True).indices]
+        heaviest_first = torch.sort(drawn[dropped], stable=True, descending=True).indices
         dropped = dropped[heaviest_first[missing:]]
     keep = torch.ones(len(opacities), dtype=torch.bool, device=opacities.device)
     keep[dropped] = False

@@ -288,7 +288,7 @@ def far_share(distances: Float[Tensor, "n"], masses: Float[Tensor, "n"]) -> Floa
 
 
 def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) -> Float[Tensor, ""]:
-    """Return the share of Gaussians at exactly the position of another of the same colour.
+    """Return the share of Gaussians that repeat exactly the position and colour of another.
 
     For large scenes it is estimated from a sample, which is chosen by a hash of the position, so
     that duplicates are sampled together. A crowd at one position counts wholly or not at all.
