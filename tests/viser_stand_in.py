@@ -34,6 +34,9 @@ class Gui:
     def __init__(self, server):
         self.server, self.controls = server, {}
 
+    def configure_theme(self, *, dark_mode, show_share_button):
+        assert (dark_mode, show_share_button) == (True, False)
+
     def _add(self, kind, label, **values):
         self.controls[label] = Handle(self.server, kind, label=label, **values)
         return self.controls[label]

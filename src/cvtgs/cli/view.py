@@ -74,7 +74,10 @@ def add_view(add_parser: AddParser) -> None:
         help=f"port to listen on; if it is taken, the next free one (default {PORT})",
     )
     parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
-    add_options(parser, "--device", "--trust-sizes", "--overwrite", "--quiet")
+    add_options(
+        parser, "--device", "--trust-sizes", "--overwrite", "--quiet",
+        overwrite="replace the file of --page; the page itself replaces none",
+    )  # fmt: skip
 
 
 def check_page(options: argparse.Namespace) -> None:

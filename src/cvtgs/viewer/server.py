@@ -13,7 +13,7 @@ import torch
 
 from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.counts import target_count
-from cvtgs.errors import CvtgsError, OutputError, memory_errors
+from cvtgs.errors import CvtgsError, OutputError, OutputExistsError, memory_errors
 from cvtgs.io.files import is_within
 from cvtgs.math.frames import robust_frame
 from cvtgs.math.parameters import build_covariances, normalize_quats
@@ -65,6 +65,8 @@ if (location.protocol === "file:") {
 """Chromium starts no worker that is a module in a page that was opened as a file. viser's worker
 sorts the Gaussians; without it, they are blended in any order."""
 
+_LABEL = 24  # letters of a scene's name in its label, which must fit on a phone
+
 _GIVE_UP = 0.5  # seconds between checks whether the server was closed
 
 
@@ -101,28 +103,28 @@ class SceneNode:
         self._server, self.name = server, printable_name(name)
         self._path, self._label = path, label
         self._splats: Any = None
+        self._lock = threading.Lock()  # controls are used in other threads than scenes are drawn
 
     def draw(self, scene: GaussianScene, *, visible: bool) -> None:
         """Draw a scene in place of the current one."""
         part = valid_part(scene).to("cpu")
         covariances = build_covariances(part.scales, normalize_quats(part.quats))
-        self._splats = self._server.scene.add_gaussian_splats(
-            self._path,
-            centers=part.means.float().numpy(),
-            covariances=covariances.float().numpy(),
-            rgbs=(0.5 + SH_C0 * part.sh0[:, 0]).clamp(0, 1).float().numpy(),
-            opacities=part.opacities[:, None].float().numpy(),
-            visible=visible,
-        )
-        self._server.scene.add_label(
-            f"{self._path}/name",
-            f"{self.name}: {counted(len(part), 'Gaussian')}",
-            position=self._label,
-        )
+        arrays = {
+            "centers": part.means.float().numpy(),
+            "covariances": covariances.float().numpy(),
+            "rgbs": (0.5 + SH_C0 * part.sh0[:, 0]).clamp(0, 1).float().numpy(),
+            "opacities": part.opacities[:, None].float().numpy(),
+        }
+        with self._lock:
+            scene_api = self._server.scene
+            self._splats = scene_api.add_gaussian_splats(self._path, **arrays, visible=visible)
+            text = f"{counted(len(part), 'Gaussian')}: {shortened(self.name, _LABEL)}"
+            scene_api.add_label(f"{self._path}/name", text, position=self._label)
 
     def show(self, visible: bool) -> None:
         """Show or hide the scene and its label."""
-        self._splats.visible = visible
+        with self._lock:
+            self._splats.visible = visible
 
 
 def record_page(server: "viser.ViserServer", nodes: Sequence[SceneNode]) -> str:
@@ -196,6 +198,8 @@ class ViewerServer:
         self._error: Exception | None = None
         self._closed, self._first = False, threading.Event()
         self._server = start_server(host, port)
+        # Like other pages with images; a shared page would go through a server of others.
+        self._server.gui.configure_theme(dark_mode=True, show_share_button=False)
         self._label = look_at(self._server, viewer.scenes[FULL].scene)
         gui, low, high, step = self._server.gui, *SLIDER
         self._facts = gui.add_markdown("")
@@ -326,7 +330,10 @@ class ViewerServer:
             raise OutputError(
                 f"{name}: a scene is saved in the folder where the program was started, or below."
             )
-        return self._viewer.save(self._shown.value, name)
+        try:
+            return self._viewer.save(self._shown.value, name)
+        except OutputExistsError as error:
+            raise OutputError(f"{name} exists already; give another name.") from error
 
     def _try(self, action: Callable[[], str]) -> Exception | None:
         """Run an action, and show its result or its error, which is returned, on the page."""

@@ -23,7 +23,7 @@
     const ratio = data.reference.count / Math.max(1, scene.count);
     if (Math.abs(ratio - 1) < 0.005) return "As many";
     const [factor, word] = ratio > 1 ? [ratio, "fewer"] : [1 / ratio, "more"];
-    const digits = factor >= 10 || Number.isInteger(factor) ? 0 : factor < 1.1 ? 2 : 1;
+    const digits = factor >= 9.95 || Number.isInteger(factor) ? 0 : factor < 1.1 ? 2 : 1;
     return `${number(factor, digits)}× ${word}`;
   };
   const join = (...parts) => parts.filter(Boolean).join(" · ");
@@ -194,7 +194,7 @@
   at("alpha").addEventListener("click", () => toggle(2));
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const typing = event.target instanceof HTMLInputElement;
+    const typing = event.target.closest?.("input, .scroller") != null;
     const key = event.key.toLowerCase();
     if (key === "n") step(1);
     else if (key === "p") step(-1);
