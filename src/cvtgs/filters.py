@@ -81,7 +81,7 @@ def filter_rows(
             max_mass_share=config.max_mass_share if is_hazy else 1.0,
             at_least=target,
         )
-    masses = analysis.areas * opacities
+    masses = analysis.masses
     if config.max_flyaway_share > 0.0 and analysis.farthest > FLYAWAY_RADII:
         distances = analysis.frame.distances(scene.means)
         seen = masses * perspective_falloff(distances)

@@ -102,7 +102,9 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
         are standardized if the target is below ``total``.
     """
     if target >= len(scene.means):
-        return Reduced(standardized(scene) if target < total else with_finite_opacities(scene))
+        singles = CellStatistics(single_member_cells=len(scene), largest_cell=1)
+        kept = standardized(scene) if target < total else with_finite_opacities(scene)
+        return Reduced(kept, singles)
     used = drop_unused_bands(scene, analysis.plan)
     origin = analysis.frame.far_origin(used.means)
     merged, partition, statistics = group_and_merge(

@@ -166,7 +166,10 @@ class Prepared:
         protected = with_finite_opacities(valid.select(first))
         part, room = analysis.select(rest), target - len(protected)
         others = self._reduce(valid.select(rest), part, room, clock, kept=protected)
-        reduced = others._replace(scene=concatenate([protected, others.scene]))
+        reduced = others._replace(
+            scene=concatenate([protected, others.scene]),
+            statistics=others.statistics.in_larger(part.masses.sum(), analysis.masses.sum()),
+        )
         reduced = self._match(reduced, part, clock)
         return self._result(reduced, checked, analysis, target, clock, kept_count=len(protected))
 
@@ -339,7 +342,7 @@ class Prepared:
     ) -> Simplified:
         """Report, restore columns that were left out, and refine if the configuration says so."""
         scene, total = self._scene, self._total
-        masses = [(analysis.areas * analysis.opacities).sum(), reduced.scene.masses.sum()]
+        masses = [analysis.masses.sum(), reduced.scene.masses.sum()]
         mass_in, mass_out = torch.stack(masses).tolist()
         views = "none"
         is_whole = target >= total - checked.invalid_count

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from functools import partial
 from pkgutil import resolve_name
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Self
 
 import pydantic
 from jaxtyping import Int
@@ -107,7 +107,7 @@ class CellStatistics(Record):
 
     Attributes:
         filtered_count: Number of faint Gaussians and flyaways that the filter dropped.
-        filtered_mass_share: Share of the mass that these hold.
+        filtered_mass_share: Share of the mass of the scene that these hold.
         single_member_cells: Number of cells that keep one Gaussian unchanged: their only member,
             or a representative.
         largest_cell: Number of members of the largest cell.
@@ -128,6 +128,11 @@ class CellStatistics(Record):
     energies: tuple[float, ...] = ()
     energy: float = 0.0
     backend: str = "none"
+
+    def in_larger(self, mass: float | Tensor, whole: float | Tensor) -> Self:
+        """Return the statistics of a part of a scene, given its mass, as those of the scene."""
+        share = float(mass) / (float(whole) or 1.0) * self.filtered_mass_share
+        return self.model_copy(update={"filtered_mass_share": share})
 
 
 class SimplifyReport(CellStatistics):

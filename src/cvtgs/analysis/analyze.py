@@ -72,6 +72,11 @@ class SceneAnalysis:
 
     __repr__ = short_repr
 
+    @property
+    def masses(self) -> Float[Tensor, "n"]:
+        """Opacity times mean projected area, squared scene units, float64."""
+        return self.areas * self.opacities
+
     def select(self, rows: Tensor) -> Self:
         """Return the analysis of some Gaussians.
 

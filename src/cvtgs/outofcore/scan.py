@@ -1,6 +1,7 @@
 """Scan of the whole scene: data that all blocks need, and the k-d partition into blocks."""
 
 import json
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -34,6 +35,7 @@ from cvtgs.grouping import curve_order
 from cvtgs.io.ply import PlyRows
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.math.frames import RobustFrame
+from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.scene import GaussianScene
 
 
@@ -114,6 +116,7 @@ def _weighted_quantile(coordinates: Tensor, weights: Tensor, share: float) -> fl
 
 SAMPLE_ROWS = 1 << 18  # size of the sample from which frame, effect plan and partition are computed
 CHUNK = 1 << 15  # number of rows that are read together
+DEVIATIONS = 4.0  # standard deviations of the number of rows that a filter from the sample leaves
 _GOLDEN = 0.6180339887498949  # multiples of it are spread evenly between whole numbers
 MAPPED_ROWS = 1 << 15  # number of rows of the file that are mapped together while a sample is read
 
@@ -159,7 +162,8 @@ class SceneScan:
     frame: RobustFrame
     plan: EffectPlan
     visibility: Float[Tensor, "voxels"]  # :func:`cvtgs.analysis.analyze.visibility_grid`
-    min_opacity: float  # the filter leaves out Gaussians of lower opacity,
+    min_opacity: float  # the filter leaves out Gaussians of lower opacity
+    min_faint_mass: float  # and of a smaller apparent mass than this; infinite: of any mass,
     max_flyaway_mass: float  # and flyaways of at most this mass times falloff; -1: none
     mean_weight: float  # in the tessellation, before the floor
     cell_weight: float  # heavier Gaussians count as one cell; 0 if all do
@@ -274,9 +278,16 @@ def scan_scene(
         sample, known = sample.select(free), known.select(free)
     row_count = totals.valid_count - totals.kept_count
     rows_per_sample, mean_mass = row_count / max(1, len(sample)), totals.mass / totals.valid_count
-    least = min(len(sample), -int(-target // rows_per_sample))
+    least = -int(-target // rows_per_sample)
+    if rows_per_sample > 1:  # a part of the rows estimates how many stay
+        least += math.ceil(DEVIATIONS * math.sqrt(least))
     no_flyaways = config.filter.model_copy(update={"max_flyaway_share": 0.0})
-    rows = filters.filter_rows(sample, known, least, no_flyaways).rows
+    is_partial = known.plan.haze.active and config.filter.max_mass_share < 1.0
+    usual = filters.filter_rows(sample, known, 1, no_flyaways).rows
+    faintest = float(known.opacities[usual].amin()) if is_partial else math.inf
+    rows = filters.filter_rows(sample, known, min(len(sample), least), no_flyaways).rows
+    min_opacity = min(faintest, config.filter.min_opacity)
+    faint = faint_masses(known.opacities[rows], known.apparent_areas[rows], min_opacity)
     power = config.cvt.area_power
     weights = cvt.gaussian_weights(known.opacities, known.apparent_areas, area_power=power)[rows]
     mean_weight = float(weights.mean()) or 1.0
@@ -288,18 +299,27 @@ def scan_scene(
         frame=frame,
         plan=known.plan,
         visibility=grid,
-        min_opacity=min(float(known.opacities[rows].amin()), config.filter.min_opacity),
+        min_opacity=min_opacity,
+        min_faint_mass=float(faint.amin()),
         max_flyaway_mass=_max_flyaway_mass(totals, config.filter.max_flyaway_share),
         mean_weight=mean_weight,
         cell_weight=cell_weight,
         partition=partition_space(frame.contract(sample.means[rows]), measure, blocks),
         view_components=_view_components(sample, known, rows, config),
         mass=totals.mass,
-        mass_unit=float(mass_unit(known.areas * known.opacities, mean_mass)),
+        mass_unit=float(mass_unit(known.masses, mean_mass)),
         invalid_rows=totals.invalid_rows,
         row_count=row_count,
         kept_count=totals.kept_count,
     )
+
+
+def faint_masses(
+    opacities: Float[Tensor, "n"], apparent_areas: Float[Tensor, "n"], min_opacity: float
+) -> Float[Tensor, "n"]:
+    """Return apparent masses, none of Gaussians that are never drawn; infinite if not faint."""
+    masses = apparent_areas.double() * opacities * (opacities >= MIN_ALPHA)
+    return torch.where(opacities < min_opacity, masses, torch.inf)
 
 
 def _view_components(

@@ -31,6 +31,7 @@ from cvtgs.outofcore.scan import (
     RowRange,
     SceneScan,
     add_totals,
+    faint_masses,
     in_cells,
     read_sample,
     scan_range,
@@ -226,7 +227,7 @@ def _filtered(
     visibility = visibility_at(scan.visibility, means, scan.frame)
     distances = scan.frame.distances(means)
     apparent = apparent_areas(areas, distances, visibility, config=config)
-    stays = opacities >= scan.min_opacity
+    stays = faint_masses(opacities, apparent, scan.min_opacity) >= scan.min_faint_mass
     if scan.max_flyaway_mass >= 0.0:
         far = distances > filters.FLYAWAY_RADII
         masses = areas * opacities * analysis.perspective_falloff(distances)
