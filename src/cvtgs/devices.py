@@ -39,7 +39,7 @@ time. With more threads, most of them wait for the lock.
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_SHORT_CHUNKS = ContextVar("short_chunks", default=False)
+_SHORT_CHUNKS: ContextVar[bool | None] = ContextVar("short_chunks", default=None)
 
 
 class _Own(threading.local):
@@ -176,8 +176,11 @@ def within_memory(
     """Compute on a device; if it runs out of memory, retry with short chunks, then on the CPU.
 
     ``compute`` takes the device and a note for the report, which is empty in the first attempt.
+    Within another such call, the outer one retries.
     """
     note = ""
+    if _SHORT_CHUNKS.get() is not None:
+        return compute(device, note)
     for is_short in (False, True):
         token = _SHORT_CHUNKS.set(is_short)
         try:

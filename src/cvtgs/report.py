@@ -35,6 +35,7 @@ class RefineReport(Record):
             improving), or ``perfect`` (there was nothing to gain).
         backend: Name of the renderer.
         device: Device of the refinement.
+        device_note: Why it ended in short chunks, or on another device; empty if it did not.
         cost: Cost of the refinement, as the stage ``refine``.
     """
 
@@ -48,6 +49,7 @@ class RefineReport(Record):
     stopped: str
     backend: str
     device: str
+    device_note: str = ""
     cost: StageCost
 
 

@@ -54,7 +54,7 @@ class Limits:
             steps = checked_whole(steps, "the number of refinement steps")
         self._start = time.perf_counter()
         self._last = self._start
-        self._seconds = None if seconds is None else float(seconds)  # also one of numpy
+        self.seconds = None if seconds is None else float(seconds)  # also one of numpy
         self._steps = steps
         self._slowest = {"step": 0.0, "check": 0.0}
         self.steps = 0
@@ -62,7 +62,7 @@ class Limits:
     @property
     def total(self) -> int:
         """Total units of progress: steps, or thousandths of the time."""
-        return 1000 if self._seconds is not None or self._steps is None else self._steps
+        return 1000 if self.seconds is not None or self._steps is None else self._steps
 
     @property
     def done(self) -> int:
@@ -73,7 +73,7 @@ class Limits:
         """Return the used share of the steps or seconds, whichever is larger."""
         of_steps = self.steps / self._steps if self._steps else 0.0
         elapsed = time.perf_counter() - self._start
-        return min(1.0, max(of_steps, elapsed / self._seconds if self._seconds else 0.0))
+        return min(1.0, max(of_steps, elapsed / self.seconds if self.seconds else 0.0))
 
     def begin(self) -> None:
         """Start to time a step or check."""
@@ -93,10 +93,10 @@ class Limits:
         """
         if self._steps is not None and self.steps >= self._steps:
             return "steps"
-        if self._seconds is None:
+        if self.seconds is None:
             return ""
         needed = time.perf_counter() - self._start + sum(self._slowest.values())
-        return "time" if needed > self._seconds else ""
+        return "time" if needed > self.seconds else ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,5 +1,7 @@
 """The public functions of refinement."""
 
+from copy import deepcopy
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -10,12 +12,18 @@ from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock, check_listener
 from cvtgs.config import RefineConfig
 from cvtgs.counts import checked_whole
-from cvtgs.devices import chosen_device, threads_for_chunks, without_autocast
-from cvtgs.errors import InvalidArgumentError, InvalidSceneError, warn
+from cvtgs.devices import chosen_device, threads_for_chunks, within_memory, without_autocast
+from cvtgs.errors import InvalidArgumentError, InvalidSceneError, memory_errors, warn
 from cvtgs.evaluation.compare import check_seen
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.refinement.images import ImageBuffer, generated_views, shared_views, split_views
+from cvtgs.refinement.images import (
+    ImageBuffer,
+    RefineViews,
+    generated_views,
+    shared_views,
+    split_views,
+)
 from cvtgs.refinement.optimize import STAGE, Limits, learning_rate_scales, optimize
 from cvtgs.rendering import ObservedViews
 from cvtgs.rendering.backends import choose_backend
@@ -102,6 +110,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
             the first scene has more Gaussians than the second.
         InvalidSceneError: A scene has no valid row.
         DeviceError: There is no such device.
+        OutOfMemoryError: The memory does not suffice. A device computes in short chunks first, and
+            with ``auto`` the CPU instead, which the report says.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -130,8 +140,6 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         check_observed(observed, "observed")
     checked_seed(seed)
     seed = int(seed)  # also one of numpy
-    place = chosen_device(device, small.device)
-    ours, theirs = _on_device(small, full, place)
     if cameras is not None:
         cameras = checked_cameras(cameras).in_both_modes()
         if len(cameras) < 2:
@@ -139,6 +147,44 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
                 f"a refinement needs at least 2 cameras, one of them to be held out; found "
                 f"{len(cameras)}."
             )
+
+    compute = partial(
+        _refine_on,
+        small=small,
+        full=full,
+        limits=limits,
+        cameras=cameras,
+        config=config,
+        thinning=thinning,
+        seed=seed,
+        frozen=frozen,
+        observed=observed,
+        listener=listener,
+    )
+    place, work = chosen_device(device, small.device), f"refining {len(small):,} Gaussians"
+    with memory_errors(work, "free some, or use smaller images (size of RefineConfig)"):
+        return within_memory(compute, place, work=work, may_leave=device == "auto")
+
+
+def _refine_on(  # noqa: PLR0913 (options by name)
+    place: torch.device,
+    note: str,
+    *,
+    small: GaussianScene,
+    full: GaussianScene,
+    limits: Limits,
+    cameras: Cameras | None,
+    config: RefineConfig,
+    thinning: int,
+    seed: int,
+    frozen: int,
+    observed: ObservedViews | None,
+    listener: ProgressListener,
+) -> Refined:
+    """Refine on a device, within limits of which earlier attempts used some seconds."""
+    limits = deepcopy(limits)
+    ours, theirs = _on_device(small, full, place)
+    if cameras is not None:
         check_seen(theirs, cameras, name="the full scene")
     clock = StageClock(listener, place)
     # The program may have disabled gradients, or be in inference mode or autocast.
@@ -149,13 +195,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         torch.enable_grad(),
         clock.stage(STAGE, limits.total),
     ):
-        if observed is not None and len(observed.cameras) > 1:
-            views = shared_views(observed, theirs, cameras, config=config, seed=seed)
-        elif cameras is None:
-            views = generated_views(theirs, config=config, seed=seed)
-            warn_of_near_plane(theirs, views.heldout, name="the full scene")
-        else:
-            views = split_views(cameras, config=config, seed=seed)
+        views = _views(theirs, cameras, observed, config=config, seed=seed)
         metrics = Metrics(ssim=False, alpha=False, most_psnr=MOST_PSNR)
         scorer = Scorer(
             theirs,
@@ -182,8 +222,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     cost = clock.costs[0]
     if found.stopped == "time" and limits.steps == 0:
         warn(
-            f"no step of the refinement fits into {seconds:g} s, so the scene is unchanged; views "
-            f"and held-out images took {cost.seconds:.1f} s."
+            f"no step of the refinement fits into {limits.seconds:g} s, so the scene is unchanged; "
+            f"views and held-out images took {cost.seconds:.1f} s."
         )
     report = RefineReport(
         steps=limits.steps,
@@ -196,9 +236,28 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         stopped=found.stopped,
         backend=choose_backend("auto", place)[0],
         device=str(place),
+        device_note=note,
         cost=cost,
     )
     return Refined(small if refined is ours else refined.to(small.device), report)
+
+
+def _views(
+    full: GaussianScene,
+    cameras: Cameras | None,
+    observed: ObservedViews | None,
+    *,
+    config: RefineConfig,
+    seed: int,
+) -> RefineViews:
+    """Return the views to learn from and those that are held out."""
+    if observed is not None and len(observed.cameras) > 1:
+        return shared_views(observed, full, cameras, config=config, seed=seed)
+    if cameras is not None:
+        return split_views(cameras, config=config, seed=seed)
+    views = generated_views(full, config=config, seed=seed)
+    warn_of_near_plane(full, views.heldout, name="the full scene")
+    return views
 
 
 def join_reports(report: SimplifyReport, refined: Refined) -> SimplifyReport:
