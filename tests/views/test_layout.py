@@ -150,7 +150,7 @@ def test_a_sky_shows_what_is_up(sky):
 
 def test_a_floor_moves_with_the_scene(monkeypatch):
     monkeypatch.setattr(layout, "find_floor", lambda *_: -0.25)
-    monkeypatch.setattr(layout, "find_up", lambda *_: UP)
+    monkeypatch.setattr(layout, "find_up", lambda *_, **__: UP)
     scene = random_scene(20)
     shifted = scene.with_tensors({"means": scene.means + torch.tensor([5.0, 6.0, 7.0])}, {})
     heights = [layout.find_layout(one).floor for one in (scene, shifted)]

@@ -93,6 +93,21 @@ def find_room(
     return None, best if least <= float(walls.double().mean()) <= most else None
 
 
+def is_enclosed(points: Float[Tensor, "v 3"]) -> bool:
+    """Return whether surfaces surround a free point near the middle, with little behind them."""
+    if len(points) == 0:
+        return False
+    middle = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
+    steps = torch.linspace(-0.3, 0.3, 5, dtype=points.dtype, device="cpu")
+    eyes = middle + torch.cartesian_prod(steps, steps, steps)
+    clearance = torch.cdist(eyes, points).amin(dim=1)
+    best = eyes[clearance.argmax()]
+    if float(clearance.amax()) < FREE or hidden_share(best, points) > _HIDDEN:
+        return False
+    up = points.new_tensor([0.0, 0.0, 1.0])
+    return enclosure(best, points, up) + enclosure(best, points, -up) >= 2 * ENCLOSED
+
+
 def are_hidden(
     eyes: Float[Tensor, "e 3"], target: Float[Tensor, "3"], points: Float[Tensor, "v 3"]
 ) -> Bool[Tensor, "e"]:
@@ -242,7 +257,8 @@ def find_layout(scene: GaussianScene) -> SceneLayout:
     voxels, local = voxelize(sample, frame), frame.normalize(positions)
     distances = torch.linalg.vector_norm(local, dim=1)
     bounded = float(distances.quantile(0.97)) < _BOUNDED
-    up = find_up(voxels, _far_directions(local, distances))
+    far, enclosed = _far_directions(local, distances), is_enclosed(voxels.points)
+    up = find_up(voxels, far, enclosed=enclosed)
     positions = voxels.points if len(voxels.points) else local[:1]
     heights = (positions @ up).quantile(positions.new_tensor(_HEIGHTS))
     together = among_others(positions)

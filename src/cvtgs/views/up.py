@@ -24,7 +24,7 @@ _ALIGNED = 0.85
 _LEAST_SCORE = 0.12  # of a ground plane: its share of all voxels times its roundness and width
 
 _USUAL = ((0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # up directions of captures
-_USUAL_EVIDENCE = (0.5, 0.3, 0.3)  # their weights relative to evidence in the scene
+_USUAL_EVIDENCE = (0.5, 0.35, 0.35)  # their weights relative to evidence in the scene
 _USUAL_BONUS = (1.5, 1.5, 1.25)
 _USUAL_COSINE = 0.85
 _SNAP_COSINE = 0.99  # 8 degrees
@@ -33,8 +33,12 @@ _BARE = 0.25  # columns lower than this show a bare floor, in robust radii
 _LEVEL = 0.7
 _BENEATH = 3.0  # penalty factor of the share of voxels beneath a floor
 _LEAST_FLOOR = 0.25  # least share of all columns that end on a floor
-_GROWTH_WEIGHT = 0.5
+_PLANE_WEIGHT = 0.5  # of the score of the largest plane
+_GROWTH_WEIGHT = 1.25
 _MOST_GROWTH = 0.4
+_LOW_WEIGHT = 0.3
+_MOST_SKEWNESS = 0.5
+_TRUSTED_FLOOR = 0.4  # share of bare columns from which on sizes do not count
 _SKY = 0.12  # distant content this far above the middle on average, relative to distance, is a sky
 _SKY_WEIGHT = 0.6
 
@@ -106,14 +110,17 @@ class Floor(NamedTuple):
     bare: float  # the same for columns with nothing on the floor
 
 
-def find_up(voxels: Voxels, far: Float[Tensor, "k 3"]) -> Float[Tensor, "3"]:
+def find_up(
+    voxels: Voxels, far: Float[Tensor, "k 3"], *, enclosed: bool = False
+) -> Float[Tensor, "3"]:
     """Return the up direction as a unit vector.
 
     The candidates are both directions of the axes and of the normal of the largest plane. Their
     scores add up: how usual they are in captures (-y most, then +y and +z), a bare floor with
     nothing beneath it, a large plane, and a sky, if distant content is on one side. If there is no
     bare floor, the sizes of Gaussians count too: captures seldom see a scene from below, and
-    unseen parts have larger Gaussians.
+    unseen parts have larger Gaussians. So does the skewness of heights: things stand on wide feet,
+    and few reach far up. Both say nothing of an ``enclosed`` scene, which is seen from its middle.
     """
     usual = voxels.points.new_tensor(_USUAL)
     if len(voxels.points) < 8:
@@ -128,9 +135,12 @@ def find_up(voxels: Voxels, far: Float[Tensor, "k 3"]) -> Float[Tensor, "3"]:
     bare = usual.new_tensor([_lowest_level(voxels, up).bare for up in ups])
     scores = evidence.amax(dim=1) + bare
     if ground is not None:
-        scores += ground.score * ((ups @ ground.normal).abs() > _SNAP_COSINE)
+        scores += _PLANE_WEIGHT * ground.score * ((ups @ ground.normal).abs() > _SNAP_COSINE)
     growth = (ups @ _growth(voxels)).clamp(-_MOST_GROWTH, _MOST_GROWTH)
-    scores += _GROWTH_WEIGHT * (1 - 3 * bare.amax()).clamp_min(0) * growth
+    low = _skewness(voxels.points @ ups.T).clamp(-_MOST_SKEWNESS, _MOST_SKEWNESS)
+    if not enclosed:
+        doubt = (1 - bare.amax() / _TRUSTED_FLOOR).clamp_min(0)
+        scores += doubt * (_GROWTH_WEIGHT * growth + _LOW_WEIGHT * low)
     if len(far):
         scores += _SKY_WEIGHT * ((ups @ far.mean(dim=0)) / _SKY).clamp(-1, 1)
     best: Tensor = ups[scores.argmax()]
@@ -176,6 +186,14 @@ def _growth(voxels: Voxels) -> Float[Tensor, "3"]:
     points = voxels.points - voxels.points.mean(dim=0)
     spread = sizes.square().sum().sqrt() * points.square().sum(dim=0).sqrt()
     return -divide((sizes[:, None] * points).sum(dim=0), spread)
+
+
+def _skewness(heights: Float[Tensor, "v d"]) -> Float[Tensor, "d"]:
+    """Return the skewness of heights along some directions, without stray ones."""
+    low, high = heights.quantile(heights.new_tensor([0.02, 0.98]), dim=0)
+    away = heights.clamp(low, high)
+    away = away - away.mean(dim=0)
+    return divide(away.pow(3).mean(dim=0), away.square().mean(dim=0).pow(1.5))
 
 
 def _thinned(voxels: Voxels) -> Voxels:
