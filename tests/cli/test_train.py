@@ -213,7 +213,7 @@ def test_validation_scenes_and_the_kept_network_can_be_chosen(made, tmp_path, ca
     [
         (lambda words: [*words[:3], "net.ckpt"], "net.ckpt: the name must end in .safetensors."),
         (lambda words: [words[0], "none.toml", *words[2:]], "none.toml: cannot be read: No such"),
-        (lambda words: [*words, "--scenes", "nowhere"], "data.folders: nowhere is not a folder."),
+        (lambda words: [*words, "--scenes", "nowhere"], "data.folders (--scenes): nowhere"),
         (lambda words: [*words, "--device", "abacus"], "device 'abacus' cannot be used here: "),
         (lambda words: [*words[:3], "nowhere/n.safetensors"], "nowhere/n.safetensors: the output"),
     ],

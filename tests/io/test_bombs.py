@@ -167,7 +167,7 @@ def test_implausible_sizes_are_refused_in_one_sentence(tmp_path: Path) -> None:
     torch.save({"more": Filler(), "splats": expanded(1)}, path)
     assert refusal(path) == (
         f"{path}: must be an intact checkpoint of tensors and plain numbers, "
-        f"found '__builtin__.bytearray'."
+        f"found '__builtin__.bytearray'; save the dictionary of tensors without other objects."
     )
 
 

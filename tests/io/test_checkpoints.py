@@ -155,20 +155,29 @@ def test_tensors_that_are_not_in_the_file_are_refused(tmp_path: Path, kind: type
         load(path)
 
 
+def test_a_dictionary_of_tensors_alone_is_read(tmp_path: Path) -> None:
+    scene, path = random_scene(7, degree=1), tmp_path / "a.pt"
+    torch.save(to_dict(scene) | {"step": 3}, path)
+    assert same_bits(load(path), scene)
+
+
 def test_checkpoints_without_a_whole_scene_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.ckpt"
     torch.save({"step": 1, "model": {"means": torch.zeros(2, 3)}}, path)
     with pytest.raises(FileFormatError) as caught:
         load(path)
     assert str(caught.value) == (
-        f"{path}: a checkpoint must hold a scene under 'splats' (gsplat) or 'pipeline' "
-        f"(nerfstudio's Splatfacto), found 'step', 'model'."
+        f"{path}: a checkpoint must hold a scene (means, quats and so on) under 'splats' (gsplat) "
+        f"or 'pipeline' (nerfstudio's Splatfacto), found 'step', 'model'."
     )
     torch.save([1, 2], path)
-    with pytest.raises(FileFormatError, match="found neither"):
+    with pytest.raises(FileFormatError, match="found nothing of it"):
         load(path)
     torch.save({"splats": {"other": torch.zeros(2, 3)}}, path)
-    with pytest.raises(FileFormatError, match="found 'splats'"):
+    with pytest.raises(FileFormatError, match="found 'other' under 'splats'"):
+        load(path)
+    torch.save({"splats": None, "step": 1}, path)
+    with pytest.raises(FileFormatError, match="found nothing of it under 'splats'"):
         load(path)
     torch.save({"splats": {"means": torch.zeros(2, 3)}}, path)
     with pytest.raises(FileFormatError, match="found none named quats, scales, opacities, sh0"):

@@ -64,8 +64,8 @@ def test_a_directory_without_a_scene_is_refused(tmp_path: Path, name: str) -> No
         load(path)
     assert str(caught.value) == (
         f"{path}: must be a file or the folder of a trained model, found a directory without "
-        f"point_cloud/iteration_*/point_cloud.ply, step-*.ckpt, point_cloud.ply, lod-meta.json "
-        f"or meta.json."
+        f"point_cloud/iteration_*/point_cloud.ply, step-*.ckpt, ckpt_*_rank0.pt, "
+        f"point_cloud.ply, lod-meta.json or meta.json."
     )
 
 
@@ -149,6 +149,21 @@ def test_the_last_step_of_a_splatfacto_run_is_read(tmp_path: Path) -> None:
         state = {"step": step, "splats": to_dict(random_scene(count))}
         torch.save(state, steps / f"step-{step:09}.ckpt")
     assert len(load(tmp_path)) == len(load(steps)) == 5
+
+
+def test_the_last_step_of_a_run_of_gsplat_is_read(tmp_path: Path) -> None:
+    steps = tmp_path / "ckpts"
+    steps.mkdir()
+    for step, count in ((999, 3), (29999, 5)):
+        state = {"step": step, "splats": to_dict(random_scene(count))}
+        torch.save(state, steps / f"ckpt_{step}_rank0.pt")
+    assert len(load(tmp_path)) == len(load(steps)) == 5
+
+
+def test_a_checkpoint_of_inrias_code_names_what_is_read(tmp_path: Path) -> None:
+    (tmp_path / "chkpnt30000.pth").write_bytes(b"")
+    with pytest.raises(FileFormatError, match=r"suffix '\.pth'; of a model .* point_cloud\.ply\.$"):
+        load(tmp_path / "chkpnt30000.pth")
 
 
 def test_point_cloud_ply_in_a_folder_is_read(tmp_path: Path) -> None:

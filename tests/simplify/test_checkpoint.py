@@ -90,8 +90,16 @@ def test_a_file_corrects_and_is_named_in_the_report(lively, kind):
 def test_a_file_selects_its_preset_unless_a_config_is_given(tmp_path):
     path = saved(tmp_path / "a.safetensors", lively_net(torch.float32), "paper")
     assert Simplifier(path).config.preset == "paper"
-    assert Simplifier(path, config="standard").config.preset == "standard"
-    assert Simplifier(path, config="standard").checkpoint.name == str(path)
+    with pytest.warns(UserWarning, match="trained on cells of the preset paper, not of standard;"):
+        chosen = Simplifier(path, config="standard")
+    assert (chosen.config.preset, chosen.checkpoint.name) == ("standard", str(path))
+
+
+@pytest.mark.parametrize(("preset", "warns"), [("paper", 1), ("standard", 0), ("high", 0)])
+def test_a_checkpoint_for_other_cells_is_used_with_a_warning(preset, warns, recwarn):
+    Simplifier("standard", preset=preset)
+    Simplifier("auto", preset=preset)
+    assert len(recwarn) == warns
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

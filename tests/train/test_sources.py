@@ -193,8 +193,8 @@ def test_invalid_rows_of_a_file_are_left_out(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"folders": ["nowhere"]}, "data.folders: {0}/nowhere is not a folder."),
-        ({"folders": ["."]}, "data.folders: {0} holds no PLY file."),
+        ({"folders": ["nowhere"]}, "data.folders (--scenes): {0}/nowhere is not a folder."),
+        ({"folders": ["."]}, "data.folders (--scenes): {0} holds no PLY file."),
         ({"folders": ["some"], "validation": ("x",)}, "data.validation: no file named x.ply in"),
         (
             {"folders": ["some", "some"]},
@@ -202,15 +202,18 @@ def test_invalid_rows_of_a_file_are_left_out(tmp_path):
         ),
         (
             {"folders": ["some"], "validation": ("a", "exam")},
-            "data: at least one training scene is needed, found none.",
+            "data: at least one training scene is needed, found none; add files, or set "
+            "data.generated.",
         ),
         (
             {"folders": ["one"], "validation": ()},
-            "data: at least one validation scene is needed, found none.",
+            "data: at least one validation scene is needed, found none; add files, or set "
+            "data.generated_validation.",
         ),
         (
             {"folders": [], "validation": ()},
-            "data: at least one training scene is needed, found none.",
+            "data: at least one training scene is needed, found none; add files, or set "
+            "data.generated.",
         ),
     ],
 )
@@ -224,6 +227,14 @@ def test_folders_that_cannot_be_used_are_errors(tmp_path, changes, text):
     with pytest.raises(ConfigError) as caught:
         find_sources(data, seed=0)
     assert str(caught.value).startswith(text.format(tmp_path))
+
+
+def test_scenes_in_other_formats_are_named(tmp_path):
+    write_scenes(tmp_path, ["a", "exam"], 5)
+    for name in ("b.spz", "c.sog", "a.transforms.json"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.warns(UserWarning, match=r": training reads PLY files only, not b.spz, c.sog\.$"):
+        find_sources(tiny_data(tmp_path), seed=0)
 
 
 def test_a_file_instead_of_a_folder_is_an_error(tmp_path):

@@ -150,7 +150,8 @@ def test_another_configuration_is_one_clear_error(tmp_path, changes):
         state.load(path, config)
     assert str(caught.value) == (
         f"{path}: the state belongs to a training run with another configuration "
-        f"({name} differs); restore the setting, or train to another output."
+        f"({name} differs); restore the setting, or train to another output"
+        f"{'; restart_step = 10 continues a finished one' * (name == 'steps')}."
     )
     assert state.step == 0
 

@@ -265,11 +265,12 @@ def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
 
     Two kinds are supported: ``step-000029999.ckpt`` of nerfstudio, which holds the scene under
     ``pipeline`` as ``_model.gauss_params.means`` (``_model.means`` before 2024) and so on; and
-    ``ckpt_29999_rank0.pt`` of gsplat's examples, which holds it under ``splats``. Nothing in the
-    file is executed, and only the scene is loaded, not the state of the optimiser. At SH degree 0,
-    Splatfacto trains colours through a sigmoid; these are converted to the usual ``sh0``. A tensor
-    that repeats numbers instead of storing them is refused, unless sizes are trusted. gsplat's
-    trainer writes a part of the scene for each of several GPUs; a warning names the other files.
+    ``ckpt_29999_rank0.pt`` of gsplat's examples, which holds it under ``splats``. A dictionary of
+    the tensors alone, with the names of gsplat, is read, too. Nothing in the file is executed, and
+    only the scene is loaded, not the state of the optimiser. At SH degree 0, Splatfacto trains
+    colours through a sigmoid; these are converted to the usual ``sh0``. A tensor that repeats
+    numbers instead of storing them is refused, unless sizes are trusted. gsplat's trainer writes a
+    part of the scene for each of several GPUs; a warning names the other files.
     """
     second = path.with_name(path.name.replace("_rank0.pt", "_rank1.pt"))
     if second != path and is_file(second):
@@ -303,19 +304,19 @@ def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
 def _scene_tensors(content: Any, path: Path) -> tuple[dict[str, Tensor], bool]:
     """Return the tensors, and whether they are from Splatfacto."""
     groups = content if isinstance(content, Mapping) else {}
-    for group in ("splats", "pipeline"):
-        state = groups.get(group)
-        if not isinstance(state, Mapping):
-            continue
-        for prefix in _PREFIXES:
-            tensors = {name: state[prefix + name] for name in _NAMES if prefix + name in state}
-            if "means" in tensors:
-                return tensors, "features_dc" in tensors
-    found = ", ".join(shown(name) for name in islice(groups, 5)) or "neither"
-    found += ", ..." if len(groups) > 5 else ""
+    group = next((name for name in ("splats", "pipeline") if name in groups), "")
+    state = groups[group] if group else groups  # the dictionary of tensors may be all there is
+    state = state if isinstance(state, Mapping) else {}
+    for prefix in _PREFIXES:
+        tensors = {name: state[prefix + name] for name in _NAMES if prefix + name in state}
+        if "means" in tensors:
+            return tensors, "features_dc" in tensors
+    found = ", ".join(shown(name) for name in islice(state, 5)) or "nothing of it"
+    found += ", ..." if len(state) > 5 else ""
     raise FileFormatError(
-        f"{path}: a checkpoint must hold a scene under 'splats' (gsplat) or "
-        f"'pipeline' (nerfstudio's Splatfacto), found {found}."
+        f"{path}: a checkpoint must hold a scene (means, quats and so on) under 'splats' (gsplat) "
+        f"or 'pipeline' (nerfstudio's Splatfacto), found {found}"
+        f"{f' under {group!r}' if group else ''}."
     )
 
 
@@ -332,7 +333,7 @@ def _unpickled(path: Path) -> Any:
         if not _ALLOWED.fullmatch(name):
             raise FileFormatError(
                 f"{path}: must be an intact checkpoint of tensors and plain numbers, "
-                f"found {shown(name)}."
+                f"found {shown(name)}; save the dictionary of tensors without other objects."
             )
         names.add(name)
     with _numpy_numbers_ignored() if names & _NUMPY_NAMES else nullcontext():

@@ -30,6 +30,7 @@ _POINTER = b"version https://git-lfs."
 
 _ITERATION = re.compile(r"iteration_(\d{1,18})")
 _STEP = re.compile(r"step-(\d{1,18})\.ckpt")
+_GSPLAT_STEP = re.compile(r"ckpt_(\d+)_rank0\.pt")
 
 
 FREE_BYTES = 1 << 26
@@ -79,6 +80,7 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
 
     - ``point_cloud/iteration_*/point_cloud.ply``, the largest iteration: a model of INRIA's code;
     - ``nerfstudio_models/step-*.ckpt`` or ``step-*.ckpt``, the largest step: a run of Splatfacto;
+    - ``ckpts/ckpt_*_rank0.pt`` or ``ckpt_*_rank0.pt``, the largest step: a run of gsplat's trainer;
     - ``point_cloud.ply``;
     - ``lod-meta.json``: a streamed SOG;
     - ``meta.json``: an unbundled SOG.
@@ -106,8 +108,8 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
     if found is None:
         raise InputError(
             f"{folder}: must be a file or the folder of a trained model, found a directory "
-            f"without point_cloud/iteration_*/point_cloud.ply, step-*.ckpt, point_cloud.ply, "
-            f"lod-meta.json or meta.json."
+            f"without point_cloud/iteration_*/point_cloud.ply, step-*.ckpt, ckpt_*_rank0.pt, "
+            f"point_cloud.ply, lod-meta.json or meta.json."
         )
     return found
 
@@ -144,6 +146,8 @@ def _scenes(folder: Path) -> Iterator[Path]:
     yield from filter(is_file, (part / "point_cloud.ply" for part in iterations))
     for steps in (folder / "nerfstudio_models", folder):
         yield from filter(is_file, _numbered(steps, _STEP))
+    for steps in (folder / "ckpts", folder):
+        yield from filter(is_file, _numbered(steps, _GSPLAT_STEP))
     for name in ("point_cloud.ply", "lod-meta.json", "meta.json"):
         if is_file(folder / name):
             yield folder / name

@@ -345,7 +345,9 @@ def _suffix_of(
         raise FileFormatError(
             f"format must be {', '.join(others)} or {last}, found {shown(format)}."
         )
+    found = f"the suffix {path.suffix!r}" if path.suffix else "no suffix"
+    if path.suffix.lower() == ".pth":
+        found += "; of a model of INRIA's code, give its folder or its point_cloud.ply"
     raise FileFormatError(
-        f"{path}: the file name must end in {', '.join(others)} or {last}, "
-        f"found {f'the suffix {path.suffix!r}' if path.suffix else 'no suffix'}."
+        f"{path}: the file name must end in {', '.join(others)} or {last}, found {found}."
     )

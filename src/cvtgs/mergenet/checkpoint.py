@@ -21,6 +21,7 @@ from cvtgs.errors import (
     InvalidArgumentError,
     check_path,
     reason_of,
+    warn,
 )
 from cvtgs.io.tensors import pack_tensors, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet
@@ -308,4 +309,10 @@ def checkpoint_for(
     if ckpt == "auto":
         preset = "standard" if config is None else config.preset
         return load_checkpoint(preset if preset in SHIPPED else "standard")
-    return load_checkpoint(ckpt)
+    found = load_checkpoint(ckpt)
+    if config is not None and (found.info.preset == "paper") != (config.preset == "paper"):
+        warn(
+            f"{found.name} was trained on cells of the preset {found.info.preset}, not of "
+            f"{config.preset}; the result may be worse than without a network."
+        )
+    return found

@@ -23,11 +23,13 @@ from cvtgs.errors import ConfigError, warn
 from cvtgs.evaluation.scorer import ViewImages
 from cvtgs.io import load
 from cvtgs.io.files import is_folder
+from cvtgs.io.formats import READABLE_SUFFIXES
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.math import parameters
 from cvtgs.mergenet import LearnedScene
 from cvtgs.scene import GaussianScene
 from cvtgs.tags import ANTIALIASED
+from cvtgs.text import first_of
 from cvtgs.train.cases import Case, MergedScene, make_case, render_targets
 from cvtgs.train.config import DataConfig, TrainConfig
 from cvtgs.validity import valid_part
@@ -85,19 +87,26 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
                 f"{one.name}.ply is for validation, but {learned[one.sha256]}.ply of the same "
                 f"content is for training."
             )
-    for is_validation, text in ((False, "training"), (True, "validation")):
+    kinds = (False, "training", "generated"), (True, "validation", "generated_validation")
+    for is_validation, text, setting in kinds:
         if not any(source.is_validation == is_validation for source in sources):
-            raise ConfigError(f"data: at least one {text} scene is needed, found none.")
+            raise ConfigError(
+                f"data: at least one {text} scene is needed, found none; add files, or set "
+                f"data.{setting}."
+            )
     return sources
 
 
 def _files_in(folder: Path) -> list[Path]:
     if not is_folder(folder):
-        raise ConfigError(f"data.folders: {folder} is not a folder.")
-    found = (path for path in folder.rglob("*") if path.suffix.lower() == ".ply")
-    files = sorted(path for path in found if not _is_hidden(path, folder))
+        raise ConfigError(f"data.folders (--scenes): {folder} is not a folder.")
+    found = sorted(path for path in folder.rglob("*") if not _is_hidden(path, folder))
+    files = [path for path in found if path.suffix.lower() == ".ply"]
     if not files:
-        raise ConfigError(f"data.folders: {folder} holds no PLY file.")
+        raise ConfigError(f"data.folders (--scenes): {folder} holds no PLY file.")
+    kinds = [suffix for suffix in READABLE_SUFFIXES if not suffix.endswith(".ply")]
+    if others := [path.name for path in found if path.suffix.lower() in kinds]:
+        warn(f"{folder}: training reads PLY files only, not {first_of(others)}.")
     return files
 
 
