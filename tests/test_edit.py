@@ -295,3 +295,8 @@ def test_scenes_of_several_layouts_become_one_of_none() -> None:
         both = concatenate(scenes, fill=True)
         assert (both.layout, both.has_two_scales) == ((), False)
     assert concatenate([flat, flat], fill=True).layout == flat.layout
+
+
+def test_filled_columns_are_in_the_usual_order() -> None:
+    first = with_normals(random_scene(2), torch.ones(2, 3))
+    assert list(concatenate([random_scene(3), first], fill=True).extras) == list(NORMALS)

@@ -142,7 +142,8 @@ def test_wrong_arguments_are_refused_before_files_are_written(scene, simplifier,
 def test_the_index_has_ratios_of_float32_as_they_were_written(scene, simplifier, tmp_path):
     rhos = torch.tensor([0.02, 0.01])
     levels = simplifier.levels(scene, rhos)
-    index = write_levels(levels, tmp_path / "out", rhos=rhos, source="a.ply")
+    index = write_levels(levels, tmp_path / "out", rhos=rhos, source="/my/scenes/a.ply")
+    assert index.source == "a.ply"
     assert [(level.rho, level.file) for level in index.levels] == [
         (0.02, "rho_0.02.ply"),
         (0.01, "rho_0.01.ply"),

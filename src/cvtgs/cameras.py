@@ -31,7 +31,7 @@ class Cameras:
         names: Name of each camera, such as its photograph's file name; empty if they have none.
         strides: For each camera, a number s: its image holds every s-th pixel of a finer one, in
             both directions, and is as sharp (:meth:`every`); ``Ks``, width and height are those of
-            the coarser grid. Empty if all are 1.
+            the coarser grid. Empty, or all 1, for whole images.
         ignores_tag: For each camera, whether images of scenes tagged ``SplatRenderMode: mip`` lack
             its opacity compensation, as in viewers that ignore the tag; empty if no camera does.
 

@@ -105,7 +105,7 @@ def _cos_sin(degrees: float) -> tuple[float, float]:
 
 @checked
 def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -> GaussianScene:
-    """Keep the Gaussians whose centres lie in a region.
+    """Keep the Gaussians whose centres lie in a region; centres with NaN lie in none.
 
     Args:
         scene: The scene; it is not changed.
@@ -132,7 +132,7 @@ def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -
 
 @checked
 def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
-    """Drop the Gaussians below an opacity.
+    """Drop the Gaussians below an opacity; invalid ones stay.
 
     Args:
         scene: The scene; it is not changed.
@@ -160,7 +160,7 @@ def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
 
 @checked
 def drop_large(scene: GaussianScene, largest: float) -> GaussianScene:
-    """Drop the Gaussians above a size.
+    """Drop the Gaussians above a size; invalid ones stay.
 
     Args:
         scene: The scene; it is not changed.
@@ -268,8 +268,8 @@ def concatenate(scenes: Iterable[GaussianScene], *, fill: bool = False) -> Gauss
             any scene is. Other extra columns that a scene lacks are left out, with a warning.
 
     Returns:
-        All Gaussians, in the order of the scenes, with all comments; the layout is that of the
-        scenes if it is the same.
+        All Gaussians, in the order of the scenes, with the comments of all, equal ones once; the
+        layout is that of the scenes if it is the same.
 
     Raises:
         InvalidSceneError: There is no scene, or the scenes do not fit together.
@@ -359,6 +359,7 @@ def _widened(
     tensors = {name: tensor.to(dtype) for name, tensor in scene.tensors().items()}
     missing = REST_COUNTS[degree] - scene.shN.shape[1]
     tensors["shN"] = torch.nn.functional.pad(tensors["shN"], (0, 0, 0, missing))
-    zeros = dict.fromkeys(extras & set(NORMALS), torch.zeros_like(tensors["means"][:, 0]))
+    zero = torch.zeros_like(tensors["means"][:, 0])
+    zeros = {name: zero for name in NORMALS if name in extras}
     kept = {name: column for name, column in scene.extras.items() if name in extras}
     return scene.with_tensors(tensors, zeros | kept)

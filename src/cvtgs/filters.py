@@ -42,7 +42,7 @@ def filter_rows(
 ) -> FilteredRows:
     """Drop faint Gaussians and flyaways, but keep at least the target number of Gaussians.
 
-    All faint Gaussians are dropped, but if they are the haze of the scene, only the faintest are.
+    All faint Gaussians are dropped; where they hold much mass together (haze), only the faintest.
 
     Args:
         scene: The Gaussians; all rows must be valid.
@@ -101,7 +101,9 @@ def visible_rows(
     max_mass_share: float,
     at_least: int,
 ) -> Bool[Tensor, "n"]:
-    """Drop the faintest Gaussians up to a share of the mass; those that are never drawn have none.
+    """Drop the faintest Gaussians up to a share of the mass.
+
+    Gaussians that are never drawn count as having no mass.
 
     With ``max_mass_share = 1`` this is the filter of CVT-GS: everything below ``min_opacity`` is
     dropped. A smaller share keeps haze, which is many faint Gaussians with real mass.

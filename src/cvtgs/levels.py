@@ -129,7 +129,7 @@ def write_levels(
         levels: The levels.
         folder: Folder to write to; created if it is missing.
         rhos: Ratio of each level.
-        source: Name or path of the full scene, for the index.
+        source: Name or path of the full scene; the index has its file name.
         suffix: File suffix, which selects the format.
         axes: The axes of the files, as :func:`cvtgs.io.change_axes` names them; None for those
             of the format.
@@ -141,6 +141,7 @@ def write_levels(
     Raises:
         InvalidArgumentError: There is no level, levels are of different scenes, or the ratios are
             not those of the levels, all different and in (0, 1].
+        FileFormatError: There is no format of this suffix.
         OutputExistsError: A file exists and may not be replaced.
         OutputError: A file cannot be written.
 
@@ -186,7 +187,7 @@ def write_levels(
         save(level.scene, place / name, overwrite=overwrite, axes=axes)
         entries.append(_entry(level, rho, place / name))
     index = LevelsIndex(
-        source=printable_name(os.fspath(source)),
+        source=printable_name(Path(source).name),
         source_count=levels[0].report.input_count,
         levels=tuple(sorted(entries, key=lambda entry: -entry.count)),
     )

@@ -56,7 +56,8 @@ def test_cameras_that_miss_the_scene_are_refused():
 def test_a_goal_that_is_nearly_reached_has_more_digits():
     assert Target("psnr", 55.734).missed(55.731) == ("55.734 dB", "55.731 dB")
     assert Target("psnr", 40.0).missed(31.2) == ("40.00 dB", "31.20 dB")
-    assert Target("ssim", 0.99999999).missed(0.999971) == ("SSIM 1.00000", "SSIM 0.99997")
+    assert Target("ssim", 0.9999999).missed(0.9983) == ("SSIM 0.9999999", "SSIM 0.9983000")
+    assert Target("psnr", 100 / 3).missed(31.2) == ("33.33 dB", "31.20 dB")
 
 
 def test_an_empty_scene_is_named(views):

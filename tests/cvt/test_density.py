@@ -148,3 +148,11 @@ def test_numbers_of_embeddings_and_weights_are_checked(wrong):
         embed(torch.zeros(2, 3), torch.zeros(2, 1, 3), frame=FRAME, color=wrong)
     with pytest.raises(InvalidArgumentError, match="area_power must be a finite number of at"):
         gaussian_weights(torch.ones(2), torch.ones(2), area_power=wrong)
+
+
+def test_weights_of_nothing_are_empty_and_floors_are_not_negative():
+    none = torch.zeros(0)
+    assert len(tessellation_weights(none, none, area_power=0.5, floor=0.1)) == 0
+    for floor in (-1.0, float("nan")):
+        with pytest.raises(InvalidArgumentError, match="floor must be"):
+            tessellation_weights(torch.ones(2), torch.ones(2), area_power=0.5, floor=floor)

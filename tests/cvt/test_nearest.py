@@ -213,3 +213,10 @@ def test_gradients_are_not_needed():
         for found, wanted in zip(search(traced, traced), search(PLANE, PLANE), strict=True):
             assert torch.equal(found, wanted)
     assert torch.equal(nearest_neighbors(traced, 3), nearest_neighbors(PLANE, 3))
+
+
+def test_neighbours_exist_where_squares_of_distances_overflow():
+    sites = torch.tensor([[0.0], [1e160], [-1e200], [1e307]], dtype=torch.float64)
+    found = nearest_neighbors(sites, 2)
+    assert found.shape == (4, 2)
+    assert set(found.flatten().tolist()) <= {0, 1, 2, 3}

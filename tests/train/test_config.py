@@ -97,6 +97,7 @@ def test_a_configuration_is_frozen():
         ("learning_rate = 0", "learning_rate: input should be greater than 0, found 0."),
         ("learning_rate = nan", "learning_rate: input should be a finite number, found nan."),
         ("[data]\nratios = [0.1, 1.0]", "data.ratios.1: input should be less than 1, found 1.0."),
+        ("[data]\nratios = [2]", "data.ratios.0: input should be less than 1, found 2."),
         ("[views]\nsizes = [10]", "views.sizes.0: input should be greater than or equal to 11"),
         ("[views]\ncrop = 10", "views.crop: input should be greater than or equal to 11"),
         ("[data]\ngenerated_counts = []", "data.generated_counts: tuple should have at least 1"),

@@ -174,7 +174,7 @@ def perspective_falloff(distances: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         distances: Distances to the centre of the scene, in robust radii.
 
     Returns:
-        ``1 / max(1, d)^2`` in float64.
+        ``1 / max(1, d)^2``, in the dtype of the distances.
 
     Example:
         >>> perspective_falloff(torch.tensor([2.0]).double()).tolist()

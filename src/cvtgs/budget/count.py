@@ -78,8 +78,11 @@ class Target(NamedTuple):
         return f"SSIM {value:.{4 + digits}f}"
 
     def missed(self, value: float) -> tuple[str, str]:
-        """Format this quality and a lower one, with as many digits as tell them apart."""
-        texts = ((self.text(self.value, more), self.text(value, more)) for more in range(9))
+        """Format this quality in full and a lower one, with as many digits as tell them apart."""
+        usual = 2 if self.metric == "psnr" else 4
+        exact = (more for more in range(9) if round(self.value, usual + more) == self.value)
+        digits = range(next(exact, 0), 9)
+        texts = ((self.text(self.value, more), self.text(value, more)) for more in digits)
         return next((pair for pair in texts if pair[0] != pair[1]), (self.text(self.value),) * 2)
 
 

@@ -56,7 +56,7 @@ def merge_pairs(
     Gaussian, plus the squared colour distance, times a power of the mass as seen in images, times
     the number of Gaussians, which keeps groups balanced. The contrast of neighbouring groups
     scales the power and the weight of colour; far mass lowers the power. Pairs that would be seen
-    at a wide angle cost more.
+    at a wide angle cost more. Where no neighbours are left to merge, groups of adjacent rows do.
 
     Args:
         groups: Moments of the groups.
@@ -68,7 +68,7 @@ def merge_pairs(
         The new group of every group, 0 to ``count - 1``.
 
     Raises:
-        InvalidArgumentError: ``count`` is outside 1 to m, or shapes or types do not fit.
+        InvalidArgumentError: ``count`` is outside 1 to m, or types do not fit.
 
     Example:
         >>> ones, x = torch.ones(3), torch.tensor([[0.0, 0.1, 5.0], [0.0] * 3, [0.0] * 3])

@@ -30,7 +30,8 @@ class Descriptors:
     Attributes:
         members: ``(n, 19)`` features of the described members; those of one cell are contiguous.
         pairs: ``(m, k, 18)`` features of the neighbours of every cell.
-        cells: ``(m, 21)`` features of the cells; the last one is their size in pixels.
+        cells: ``(m, 21)`` features of the cells; the last one is 0.3 times the logarithm of their
+            size in pixels, within limits.
         weights: ``(n,)`` share of the mass of the cell that each stands for; those of one cell sum
             to 1.
         shares: ``(n,)`` the same for the number of members.

@@ -33,7 +33,9 @@ SAMPLED_PAIRS = 1 << 14  # approximate number of pairs of neighbours in which co
 
 
 class Moments(NamedTuple):
-    """Mean, covariance and colour of Gaussians or of groups, one column per item, float64.
+    """Mean, covariance and colour of Gaussians or of groups, one column per item.
+
+    :func:`gaussian_moments` returns float64.
 
     Attributes:
         counts: ``(n,)`` number of Gaussians.

@@ -94,9 +94,12 @@ def explain(
     Returns:
         The first problems, each with its key and value, long ones shortened.
     """
-    problems, count = [], error.error_count()
-    for problem in error.errors(include_url=False)[:MOST_PROBLEMS]:
-        key = named(".".join(str(part) for part in problem["loc"]))
+    found = error.errors(include_url=False)
+    wrong = {problem["loc"][:-1] for problem in found}  # what lacks entries since these are wrong
+    found = [one for one in found if one["type"] != "too_short" or one["loc"] not in wrong]
+    problems, count = [], len(found)
+    for problem in found[:MOST_PROBLEMS]:
+        key = named(".".join(str(part) for part in problem["loc"])) or "the value"
         if problem["type"] == "extra_forbidden":
             problems.append(f"{key}: is not a known setting{_nearest(model, problem['loc'])}")
         elif problem["type"] == "model_type":

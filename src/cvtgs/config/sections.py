@@ -100,7 +100,7 @@ class TessellationConfig(Section):
             negative, colour counts more with fewer cells.
         seeding: Deterministic strata of equal weight, or weighted random draws.
         iterations: Maximum number of Lloyd iterations.
-        tolerance: Lloyd stops when an iteration lowers the energy by less than this share.
+        tolerance: Lloyd stops when an iteration lowers the energy by no more than this share.
         samples_per_site: Gaussians per cell that Lloyd samples; small samples are enlarged, and 0,
             or half of the Gaussians or more, uses all.
     """

@@ -106,7 +106,11 @@ def tessellation_weights(
         floor: No weight is below this share of the mean weight.
 
     Returns:
-        Weights in float64 with mean 1 (before the floor); 1 everywhere if all would be 0.
+        Weights in float64 with mean 1 (before the floor); 1 everywhere if all would be 0, or one is
+        NaN.
+
+    Raises:
+        InvalidArgumentError: The floor or the power is below 0, or shapes do not fit.
 
     Example:
         >>> tessellation_weights(
@@ -115,6 +119,9 @@ def tessellation_weights(
         ... ).tolist()
         [0.5, 1.5]
     """
+    check_not_negative(floor, "floor")
+    if len(areas) == 0:
+        return areas.double()
     largest_area = areas.amax().clamp_min(torch.finfo(torch.float64).tiny)
     raw = gaussian_weights(opacities, areas / largest_area, area_power=area_power)
     largest = raw.amax()

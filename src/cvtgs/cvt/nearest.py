@@ -237,6 +237,7 @@ def _nearest_apart(
         distances[part], rows[part] = tree.query(np.asarray(points[part]), k=ranks)
 
     _in_threads(search, len(points))
+    rows = np.minimum(rows, len(sites) - 1)  # one too many where squares of distances overflow
     return torch.from_numpy(rows), torch.from_numpy(distances)
 
 

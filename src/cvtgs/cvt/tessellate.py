@@ -28,7 +28,8 @@ class Tessellation:
         labels: ``(n,)`` cell of every point, 0 to m - 1; every cell has a point.
         sites: ``(m, d)`` sites that the labels refer to, on the device of the search.
         energies: ``sum w |x - site|^2`` before every Lloyd iteration, over the points that Lloyd
-            samples.
+            samples; if it stops early, also after the last one. A single 0 if every point is a
+            cell.
         energy: The same for the final labels, over all points.
         refilled: Number of empty cells that received a point from another cell.
     """
@@ -250,7 +251,8 @@ class LloydResult:
 
     Attributes:
         sites: ``(m, d)`` final sites.
-        energies: ``sum w |x - site|^2`` before each iteration, in order.
+        energies: ``sum w |x - site|^2`` before each iteration, in order; if it stops early, also
+            after the last one.
     """
 
     sites: Float[Tensor, "m d"]

@@ -113,7 +113,7 @@ def evaluate(
         reference_name: Name of the full scene.
         photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too.
         settings: Background, LPIPS network and backend.
-        listener: Called after each image.
+        listener: Called before the first image and after each.
 
     Returns:
         The scores, per view and on average.
@@ -166,7 +166,7 @@ def compare(  # noqa: PLR0913 (options by name)
             always use all views. None keeps all.
         photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too.
         settings: Background, LPIPS network and backend.
-        listener: Called after each image.
+        listener: Called before the first image and after each.
 
     Returns:
         The images and the scores.

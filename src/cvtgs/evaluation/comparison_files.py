@@ -64,11 +64,11 @@ def write_comparison(
     """Write ``index.html``, ``sheet.png`` and ``errors.png``, each completely or not at all.
 
     Args:
-        comparison: Images and scores, at least one simplified scene.
+        comparison: Images and scores.
         folder: The output folder; created if missing.
         overwrite: Whether existing files may be replaced.
         viewer: File name of a page with the scenes in 3D to link to, in the folder; or empty.
-        listener: Called after each file.
+        listener: Called before the first file and after each.
 
     Returns:
         The paths of the files.

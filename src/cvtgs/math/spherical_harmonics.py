@@ -190,7 +190,7 @@ def rotated_rest(
         rotation: Rotation matrix.
 
     Returns:
-        The bands of the rotated Gaussians; ``shN`` itself if it is empty.
+        The bands of the rotated Gaussians; ``shN`` itself if it has no bands.
 
     Raises:
         InvalidArgumentError: ``shN`` has a number of coefficients that belongs to no degree.

@@ -102,7 +102,7 @@ class Checkpoint:
         net: The network on the CPU, float32, without gradients.
         info: The description in the file.
         name: Name of the shipped checkpoint, or path of the file.
-        digest: SHA-256 of the weights and the description, hexadecimal.
+        digest: SHA-256 of the weights and of the description as the file words it, hexadecimal.
     """
 
     net: Net

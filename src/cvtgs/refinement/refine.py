@@ -99,7 +99,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         observed: Existing images of the full scene, with the size and stride of the configuration.
             They are used first; as many are held out as of cameras. A single one is not used, since
             it could only be held out.
-        listener: Called after every step, with the gain so far as its note.
+        listener: Called at the start, after steps and checks, with the gain so far as its note, and
+            at the end.
 
     Returns:
         The scene and the report.

@@ -33,8 +33,8 @@ class Rendering:
     """Images of a scene.
 
     Attributes:
-        rgb: ``(c, h, w, 3)`` red, green, blue over the background; at least 0, and above 1 where
-            the scene's colours are.
+        rgb: ``(c, h, w, 3)`` red, green, blue over the background; at least 0 if that is, and
+            above 1 where the scene's colours are.
         alpha: ``(c, h, w)`` share of the background that the Gaussians hide, 0 to 1.
         depth: ``(c, h, w)`` mean depth along the view axis, weighted by ``alpha * T``, scene
             units; 0 in empty pixels; None unless requested.

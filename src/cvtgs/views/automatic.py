@@ -185,7 +185,7 @@ def automatic_views(
     Raises:
         InvalidArgumentError: Count or size is no whole number above 0, or the seed is no whole
             number.
-        InvalidSceneError: The scene has no valid row, or is larger than 1e14 units.
+        InvalidSceneError: The scene has no valid row, or reaches beyond 1e14 units.
 
     Example:
         >>> from cvtgs.synthetic import scene

@@ -59,7 +59,7 @@ def random_views(
     Raises:
         InvalidArgumentError: The count or the seed is no whole number, the count is negative, the
             size is no whole number above 0, or ``reach`` is no range.
-        InvalidSceneError: The scene has no valid row, or is larger than 1e14 units.
+        InvalidSceneError: The scene has no valid row, or reaches beyond 1e14 units.
 
     Example:
         >>> from cvtgs.synthetic import scene
@@ -132,7 +132,7 @@ def mixed_views(
     Raises:
         InvalidArgumentError: Count or size is no whole number above 0, or the seed is no whole
             number.
-        InvalidSceneError: The scene has no valid row, or is larger than 1e14 units.
+        InvalidSceneError: The scene has no valid row, or reaches beyond 1e14 units.
 
     Example:
         >>> from cvtgs.synthetic import scene

@@ -165,7 +165,7 @@ def find_view_positions(scene: SceneLike) -> CameraPositions:
         one that is above the floor.
 
     Raises:
-        InvalidSceneError: The scene has no valid row, or is larger than 1e14 units.
+        InvalidSceneError: The scene has no valid row, or reaches beyond 1e14 units.
 
     Example:
         >>> from cvtgs.synthetic import scene
