@@ -335,7 +335,8 @@ def test_a_ground_across_x_gives_a_unit_vector(sense):
     points = torch.rand(500, 3, generator=generator, dtype=torch.float64) - 0.5
     points[:, 0] = 0.01 * points[:, 0]
     normals = torch.tensor([[sense, 0.0, 0.0]], dtype=torch.float64).repeat(500, 1)
-    up = find_up(Voxels(points=points, normals=normals, log_sizes=points[:, 0]), points[:0])
+    sizes = -points[:, 0]  # smaller above
+    up = find_up(Voxels(points=points, normals=normals, log_sizes=sizes), points[:0])
     assert up.tolist() == [1.0, 0.0, 0.0]
 
 

@@ -39,6 +39,20 @@ def test_a_weak_sign_does_not_outweigh_what_is_usual() -> None:
         assert found.tolist() == list(USUAL["-y"])
 
 
+@pytest.mark.parametrize("name", USUAL)
+def test_a_thin_scene_that_is_bare_on_both_sides_has_large_gaussians_below(name: str) -> None:
+    """Such as a stone on grass, captured without what is around."""
+    up = torch.tensor(USUAL[name]).double()
+    side = torch.linspace(-2, 2, 45).double()
+    flat = torch.cartesian_prod(side, side) @ torch.linalg.svd(up[None]).Vh[1:]
+    points = torch.cat([flat, flat + 0.12 * up])
+    sizes = torch.zeros(len(points)).double()
+    sizes[: len(flat)] = 1.0
+    normals = up.expand_as(points).clone()
+    voxels = Voxels(points=points, normals=normals, log_sizes=sizes)
+    assert find_up(voxels, NO_SKY).tolist() == list(USUAL[name])
+
+
 @pytest.mark.parametrize("side", [(1.0, 0, 0), (-1.0, 0, 0), (0, 0, 1.0)])
 def test_an_unseen_back_is_not_below(side: tuple[float, ...]) -> None:
     """A file with y down of an object that was seen from one side only."""

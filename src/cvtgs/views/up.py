@@ -38,7 +38,7 @@ _GROWTH_WEIGHT = 1.25
 _MOST_GROWTH = 0.4
 _LOW_WEIGHT = 0.3
 _MOST_SKEWNESS = 0.5
-_TRUSTED_FLOOR = 0.4  # share of bare columns from which on sizes do not count
+_TRUSTED_FLOOR = 0.4  # share of bare columns, beyond that of the other side, at which sizes end
 _SKY = 0.12  # distant content this far above the middle on average, relative to distance, is a sky
 _SKY_WEIGHT = 0.6
 
@@ -139,7 +139,8 @@ def find_up(
     growth = (ups @ _growth(voxels)).clamp(-_MOST_GROWTH, _MOST_GROWTH)
     low = _skewness(voxels.points @ ups.T).clamp(-_MOST_SKEWNESS, _MOST_SKEWNESS)
     if not enclosed:
-        doubt = (1 - bare.amax() / _TRUSTED_FLOOR).clamp_min(0)
+        clear = bare - bare[(ups @ ups.T).argmin(dim=1)]  # a thin scene is bare on both sides
+        doubt = (1 - clear.amax() / _TRUSTED_FLOOR).clamp_min(0)
         scores += doubt * (_GROWTH_WEIGHT * growth + _LOW_WEIGHT * low)
     if len(far):
         scores += _SKY_WEIGHT * ((ups @ far.mean(dim=0)) / _SKY).clamp(-1, 1)
