@@ -90,7 +90,7 @@ def test_reading_leaves_torch_safe_globals_unchanged(tmp_path: Path) -> None:
 def test_names_that_the_program_declares_safe_meanwhile_stay(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before, true = torch.serialization.get_safe_globals(), torch.load
+    before, true = [*torch.serialization.get_safe_globals()], torch.load
 
     def reading(*args: Any, **values: Any) -> Any:
         assert "scalar" in {item.__name__ for item in torch.serialization.get_safe_globals()}
