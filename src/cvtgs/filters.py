@@ -161,10 +161,11 @@ def most_flyaways(total: int) -> int:
 def flyaway_rows(
     distances: Float[Tensor, "n"], masses: Float[Tensor, "n"], *, max_share: float
 ) -> Bool[Tensor, "n"]:
-    """Find Gaussians that lie absurdly far away and contribute next to nothing.
+    """Find Gaussians beyond 100 robust radii that contribute next to nothing.
 
     Merging them with others would give one huge blob. A sky has real mass, and stays. If more than
-    a hundredth of all Gaussians lie there, they are what stands around a small detailed object.
+    a hundredth of all Gaussians (and more than ten) lie there, they are what stands around a small
+    detailed object, and none is a flyaway.
 
     Args:
         distances: Distances from the middle of the scene, in robust radii.

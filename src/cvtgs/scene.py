@@ -44,7 +44,8 @@ class GaussianScene:
         logit_opacities: ``(n,)`` logits of the opacities; infinities are valid.
         sh0: ``(n, 1, 3)`` constant SH band of red, green, blue.
         shN: ``(n, k, 3)`` view-dependent SH bands, k in {0, 3, 8, 15}.
-        extras: Further columns ``(n,)`` by name, of types that torch can index; carried along.
+        extras: Further columns ``(n,)`` by name, of floats, bool, uint8 or signed integers; carried
+            along.
         comments: Comment lines of the file, such as ``SplatRenderMode: mip``.
         layout: Property names and types of the file, in order; empty if there was no file.
             ``cvtgs.io`` writes the scene with the same layout; a file without a third scale holds
@@ -196,7 +197,7 @@ class GaussianScene:
         """Return some of the Gaussians, with all their tensors and extra columns.
 
         Args:
-            rows: Row numbers, or a mask.
+            rows: Row numbers, of which negative ones count from the end, or a mask.
 
         Returns:
             A scene with a copy of those rows.

@@ -266,9 +266,9 @@ def keep_representatives(
     member of opacity a and area A removes about ``a^2 A`` of the squared error of an image; a
     Gaussian that spreads the mass M of the cell over its area A removes ``M^2 / A``. So the member
     of largest ``a^2 A`` is kept, bit for bit, where that is more. It is also kept where it has more
-    than ``DOMINANT`` of the mass: moments would hardly differ, but a sky Gaussian as wide as its
-    distance covers an image as fog where a small move brings it from behind a camera to before it.
-    Our own rules, not part of CVT-GS.
+    than ``DOMINANT`` of the mass: moments would hardly differ, but a very wide sky Gaussian that
+    moves from behind a camera to before it covers its image as fog. Our own rules, not part of
+    CVT-GS.
 
     Args:
         scene: The Gaussians.

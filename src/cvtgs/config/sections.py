@@ -43,7 +43,7 @@ class EffectsConfig(Section):
         sh: Highest degree of view-dependent colour; ``on`` for all bands, ``off`` for degree 0.
             Bands above it are written as zeros.
         mip: Whether a scene with the Mip-Splatting tag is rendered with the compensation of
-            Mip-Splatting, and its cells are merged for it. The tag is kept in any case.
+            Mip-Splatting, and its cells are merged for it. The result keeps the tag in any case.
         unbounded: Whether far positions are contracted, if there are any.
         haze: Whether faint Gaussians are kept by their mass; ``off`` drops all of them.
         flat: Whether a scene of Gaussians with two scales (2DGS) keeps two scales.
@@ -134,10 +134,10 @@ class AllocationConfig(Section):
             them in common (:func:`cvtgs.cells.view_components`); 0 leaves them out.
         mass_power: The cost of a pair is multiplied by its apparent mass to this power, at a
             contrast of 0.2; the power is in proportion to the contrast.
-        far_relief: This power is reduced by this share where all mass lies beyond three robust
+        far_relief: Share by which ``mass_power`` is reduced where all mass lies beyond three robust
             radii, and in proportion where some does: layers of far Gaussians hide one another, so
-            they show less than their mass. Below one cell per ten Gaussians, the share is in
-            proportion to their ratio.
+            they show less than their mass. Below one cell per ten Gaussians, it is in proportion
+            to their ratio.
         widest: Standard deviation of a cell in all directions together, divided by its distance
             from viewers, above which merging costs much more in scenes with far mass, so that
             merged skies do not become fog; 0 sets no limit.

@@ -25,8 +25,8 @@ class Tessellation:
     """Points grouped into cells.
 
     Attributes:
-        labels: ``(n,)`` cell of every point, 0 to m - 1; every cell has a point.
-        sites: ``(m, d)`` sites that the labels refer to, on the device of the search.
+        labels: ``(n,)`` cell of every point, 0 to m - 1, int64; every cell has a point.
+        sites: ``(m, d)`` sites that the labels refer to, float64, on the device of the search.
         energies: ``sum w |x - site|^2`` before every Lloyd iteration, over the points that Lloyd
             samples; if it stops early, also after the last one. A single 0 if every point is a
             cell.
@@ -63,8 +63,8 @@ def tessellate(
         count: Number of cells, 1 to n.
         config: Seeding and iterations.
         seed: Seed of weighted seeding.
-        has_duplicates: Whether to search for runs of equal points only once, which does not
-            change the result.
+        has_duplicates: Whether runs of equal points are searched once each, which does not change
+            the result.
         on_iteration: Called with the number of finished Lloyd iterations.
 
     Returns:
@@ -341,7 +341,7 @@ def centroids(
 def fill_empty_cells(
     labels: Int[Tensor, "n"], weights: Float[Tensor, "n"], squared: Float[Tensor, "n"], count: int
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"], int]:
-    """Move one point into every empty cell: the points of largest cost.
+    """Move one point into every empty cell: those of the largest weight times squared distance.
 
     Each cell keeps its cheapest point, so no cell becomes empty. A point in a cell of its own
     costs nothing, so the energy never rises.

@@ -62,8 +62,8 @@ class RobustFrame:
             points: Positions, scene units.
 
         Returns:
-            The centre as float32; None for other points. Differences of points from it are exact,
-            but for a few that lie nearer to the origin.
+            The centre as float32; None for other points. Differences of points from it are exact
+            where a coordinate is within a factor of two of the centre's (Sterbenz' lemma).
         """
         if points.dtype != torch.float32 or float(self.center.abs().amax()) < FAR * self.radius:
             return None

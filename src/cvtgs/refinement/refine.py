@@ -97,8 +97,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
             for scenes on the CPU. The result is on the device of the small scene.
         frozen: Number of Gaussians at the start of the scene that stay bit for bit.
         observed: Existing images of the full scene, with the size and stride of the configuration.
-            They are used first; as many are held out as of cameras. A single one is not used, since
-            it could only be held out.
+            They are used first; an eighth of them, as of cameras, is held out. A single one is not
+            used, since it could only be held out.
         listener: Called at the start, after steps and checks, with the gain so far as its note, and
             at the end.
 

@@ -166,7 +166,8 @@ def automatic_views(
     around and above, and the Gaussians behind these surfaces are larger than those before them.
     They stand only where :class:`cvtgs.views.CameraPositions` admits them, unless it admits no
     candidate. Every camera is scored by an image of 64 pixels. If it is inside a Gaussian, has a
-    near obstacle in its image, or sees nothing, the first good alternate replaces it, or the best.
+    near obstacle in its image, or sees nothing, the first alternate without such a fault replaces
+    it, or else the one of the best score.
 
     The same scene, count, size and seed give the same cameras. Memory: a sample of at most
     30,000 Gaussians, and masks of the scene.

@@ -123,11 +123,11 @@ def mixed_views(
         count: Number of views, at least 1.
         size: Side of the square images, pixels.
         seed: Seed of the random numbers.
-        sharp: Whether views of large splats are used last; not for scenes with merged parts, nor
-            in training.
+        sharp: Whether views of large splats are used last. Use False for scenes with merged parts,
+            whose splats are large everywhere.
 
     Returns:
-        The cameras: automatic, near, then other random views.
+        The cameras, float64, without names: automatic, near, then other random views.
 
     Raises:
         InvalidArgumentError: Count or size is no whole number above 0, or the seed is no whole
