@@ -300,3 +300,10 @@ def test_scenes_of_several_layouts_become_one_of_none() -> None:
 def test_filled_columns_are_in_the_usual_order() -> None:
     first = with_normals(random_scene(2), torch.ones(2, 3))
     assert list(concatenate([random_scene(3), first], fill=True).extras) == list(NORMALS)
+
+
+def test_the_comments_of_all_scenes_are_kept() -> None:
+    texts = (("mine", "both"), ("both", "yours"))
+    scenes = [replace(random_scene(2), comments=lines) for lines in texts]
+    for fill in (False, True):
+        assert concatenate(scenes, fill=fill).comments == ("mine", "both", "yours")

@@ -37,6 +37,24 @@ def test_blocks_leave_out_the_same_gaussians(scene, tmp_path, preset, target) ->
     assert report.filtered_mass_share == pytest.approx(whole.filtered_mass_share)
 
 
+def test_the_faintest_of_a_haze_are_left_out_up_to_its_share(scene, tmp_path) -> None:
+    """Nearly all lie below the threshold of opacity, and hold much of the mass."""
+    ranks = torch.arange(COUNT)
+    faint = 0.0041 + 0.0008 * ranks / COUNT
+    opacities = torch.where(ranks % 10 == 0, 0.9, faint)
+    sizes = torch.where(ranks % 10 == 0, -5.0, -2.0)[:, None].expand(COUNT, 3)
+    hazy = scene.with_tensors(logit_opacities=torch.logit(opacities), log_scales=sizes.contiguous())
+    cvtgs.save(hazy, tmp_path / "in.ply")
+    simplifier = Simplifier(preset="fast", device="cpu")
+    whole = simplifier.run(hazy, 0.02).report
+    report = simplify_file(
+        tmp_path / "in.ply", tmp_path / "out.ply", 0.02, blocks=4, simplifier=simplifier
+    )
+    assert whole.plan.haze.active
+    assert report.filtered_count == whole.filtered_count
+    assert 10 < whole.filtered_count < 100
+
+
 @pytest.mark.parametrize("rows", [400, 1000])
 def test_a_sample_leaves_few_more_than_wanted(scene, tmp_path, rows, monkeypatch) -> None:
     """With as many as the sample predicts, half of all runs would have too few, and no filter."""

@@ -25,6 +25,24 @@ def test_auto_refines_on_the_cpu_if_a_device_lacks_memory() -> None:
     assert found.report.steps == 3
 
 
+def test_steps_of_a_failed_attempt_do_not_count(monkeypatch) -> None:
+    full, step = full_scene(200), optimize.optimize
+
+    def fails_at_the_end(scene, *args, limits, **options):
+        found = step(scene, *args, limits=limits, **options)
+        if scene.device.type != "cpu":
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB")
+        return found
+
+    monkeypatch.setattr(import_module("cvtgs.refinement.refine"), "optimize", fails_at_the_end)
+    options = {"steps": 8, "cameras": ring(4), "config": quick()}
+    wanted = refine(discolored(full), full, device="cpu", **options)
+    with pretended_cuda():
+        found = refine(discolored(full), full, **options)
+    assert same_bits(found.scene, wanted.scene)
+    assert (found.report.steps, found.report.gain > 0) == (8, True)
+
+
 def test_a_named_device_is_not_left() -> None:
     full = full_scene(200)
     with pretended_cuda(largest=1000), pytest.raises(OutOfMemoryError) as caught:

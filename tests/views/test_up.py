@@ -53,6 +53,17 @@ def test_a_thin_scene_that_is_bare_on_both_sides_has_large_gaussians_below(name:
     assert find_up(voxels, NO_SKY).tolist() == list(USUAL[name])
 
 
+@pytest.mark.parametrize("name", ["-y", "+y"])
+def test_things_stand_on_wide_feet(name: str) -> None:
+    """A cone, whose Gaussians are all of one size."""
+    up = torch.tensor(USUAL[name]).double()
+    voxels = ball(0.0, up)
+    heights = voxels.points @ up
+    points = voxels.points + (0.5 * (1 + heights).square() - heights)[:, None] * up
+    cone = Voxels(points=points, normals=voxels.normals, log_sizes=torch.zeros(2000).double())
+    assert find_up(cone, NO_SKY).tolist() == list(USUAL[name])
+
+
 @pytest.mark.parametrize("side", [(1.0, 0, 0), (-1.0, 0, 0), (0, 0, 1.0)])
 def test_an_unseen_back_is_not_below(side: tuple[float, ...]) -> None:
     """A file with y down of an object that was seen from one side only."""
@@ -73,6 +84,13 @@ def test_rooms_are_not_upside_down(count: int) -> None:
     layout = find_layout(cvtgs.synthetic.scene("room", count, sh_degree=0, seed=2))
     assert is_enclosed(layout.voxels.points)
     assert layout.up.tolist() == list(USUAL["-y"])
+
+
+def test_a_shell_is_enclosed_until_it_is_open_to_one_side() -> None:
+    shell = ball(0.0, torch.tensor([0.0, 0.0, 1.0]).double()).points
+    assert is_enclosed(shell)
+    assert not is_enclosed(shell[shell[:, 2] > 0.0])
+    assert not is_enclosed(shell[shell[:, 2] < 0.0])
 
 
 @pytest.mark.parametrize("kind", ["object", "courtyard", "landscape"])
