@@ -72,7 +72,7 @@ def count(text: str) -> int:
 
 def seconds(text: str) -> float:
     """Read a time in seconds, for argparse."""
-    found = re.fullmatch(r"([\d.]+(?:e[+-]?\d+)?)([a-z]*)", text.strip())
+    found = re.fullmatch(r"([\d.]+(?:e[+-]?\d+)?)\s*([a-z]*)", text.strip().lower())
     try:
         return float(found[1]) * _UNITS[found[2]]  # type: ignore[index]
     except (TypeError, ValueError, KeyError):
