@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # before torch is imported
@@ -12,6 +13,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in background jobs o
 
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -33,6 +35,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def coarse_light(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compute visibility on a grid of 16 voxels a side; 128 would take most of the test time."""
     monkeypatch.setattr(import_module("cvtgs.analysis.analyze"), "HALF_GRID", 8)
+
+
+@pytest.fixture
+def without_viser(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put a stand-in in the place of viser and its server, which need not be installed."""
+    monkeypatch.setitem(sys.modules, "viser", import_module("viser_stand_in"))
+    monkeypatch.setitem(sys.modules, "websockets.asyncio.server", SimpleNamespace(serve=None))
 
 
 @pytest.fixture(scope="session")

@@ -307,3 +307,8 @@ def test_the_comments_of_all_scenes_are_kept() -> None:
     scenes = [replace(random_scene(2), comments=lines) for lines in texts]
     for fill in (False, True):
         assert concatenate(scenes, fill=fill).comments == ("mine", "both", "yours")
+
+
+def test_a_single_scene_needs_no_list() -> None:
+    scene = random_scene(2)
+    assert concatenate(scene) is scene

@@ -24,16 +24,12 @@ from scenes import random_scene, same_bits
 
 FACTS, NOTES = "markdown 0", "markdown 7"
 
+pytestmark = pytest.mark.usefixtures("without_viser")
+
 
 @pytest.fixture
 def scene() -> GaussianScene:
     return random_scene(500, degree=1, size=0.05)
-
-
-@pytest.fixture(autouse=True)
-def without_viser(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "viser", viser_stand_in)
-    monkeypatch.setitem(sys.modules, "websockets.asyncio.server", SimpleNamespace(serve=None))
 
 
 @pytest.fixture

@@ -1,9 +1,7 @@
 """Scenes on a page, and standalone pages of them, on a stand-in for viser."""
 
 import math
-import sys
 import threading
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,16 +12,12 @@ from cvtgs.viewer import scene_page
 from cvtgs.viewer.server import SceneNode
 from scenes import random_scene
 
+pytestmark = pytest.mark.usefixtures("without_viser")
+
 
 @pytest.fixture
 def scene() -> GaussianScene:
     return random_scene(500, degree=1, size=0.05)
-
-
-@pytest.fixture(autouse=True)
-def without_viser(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "viser", viser_stand_in)
-    monkeypatch.setitem(sys.modules, "websockets.asyncio.server", SimpleNamespace(serve=None))
 
 
 @pytest.mark.slow

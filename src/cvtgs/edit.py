@@ -302,11 +302,11 @@ def concatenate(scenes: Iterable[GaussianScene], *, fill: bool = False) -> Gauss
         comments = TWO_SCALES.removed_from(comments)
     elif not layout and not TWO_SCALES.is_in(comments):  # then no layout says so
         comments = (*comments, TWO_SCALES.text)
-    names, columns = first.tensors(), parts[0].extras
+    tensors = [part.tensors() for part in parts]
     return replace(
         first,
-        **{name: torch.cat([part.tensors()[name] for part in parts]) for name in names},
-        extras={name: _joined([part.extras[name] for part in parts]) for name in columns},
+        **{name: torch.cat([each[name] for each in tensors]) for name in tensors[0]},
+        extras={name: _joined([part.extras[name] for part in parts]) for name in parts[0].extras},
         comments=comments,
         layout=layout,
     )
@@ -314,7 +314,7 @@ def concatenate(scenes: Iterable[GaussianScene], *, fill: bool = False) -> Gauss
 
 def _listed(scenes: Iterable[object]) -> list[GaussianScene]:
     """Return several scenes as a list; raise if there is none, or not all are on one device."""
-    given = list(scenes) if isinstance(scenes, Iterable) else []
+    given = list(scenes) if isinstance(scenes, Iterable) else [scenes]
     found = [scene for scene in given if isinstance(scene, GaussianScene)]
     if not found or len(found) < len(given):
         raise InvalidSceneError(f"concatenate needs at least one scene, found {shown(scenes)}.")

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import cvtgs
-from benchmarks import cameras as camera_files, choices, heights
+from benchmarks import cameras as camera_files, choices, heights, upright
 from cvtgs.edit import Motion, move
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.tags import ANTIALIASED
@@ -196,3 +196,20 @@ def test_every_variant_is_compared_with_standard_at_every_height(tmp_path, monke
     assert all(5 < float(value) < 60 for value in rows[0][2:])
     assert {float(value) for value in rows[1][2:]} == {0.0}
     assert any(float(value) != 0.0 for value in rows[2][2:])
+
+
+def test_up_is_looked_for_in_every_convention(tmp_path, capsys):
+    """The same place, once as it is and once turned to z up."""
+    scene, files = cvtgs.synthetic.scene("courtyard", 2000, sh_degree=0, seed=0), []
+    half = 0.5**0.5
+    for name, quat in (("down", (1, 0, 0, 0)), ("turned", (half, -half, 0, 0))):
+        files.append(str(tmp_path / f"{name}.ply"))
+        cvtgs.save(move(scene, Motion(quat=quat)), files[-1])
+    upright.main([*files, "--up", "turned=+z"])
+    assert capsys.readouterr().out.splitlines()[2:] == [
+        "| down | 0° | 0° | 0° |",
+        "| turned | 0° | 0° | 0° |",
+        "| wrong | 0 | 0 | 0 |",
+    ]
+    upright.main([files[1]])
+    assert capsys.readouterr().out.splitlines()[-1] == "| wrong | 1 | 1 | 1 |"

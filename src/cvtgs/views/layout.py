@@ -76,9 +76,8 @@ def find_room(
     offsets = torch.cartesian_prod(steps, steps) @ torch.linalg.svd(up[None]).Vh[1:]
     lifts = torch.tensor([0.45, 0.55, 0.65], dtype=points.dtype, device="cpu") * (high - low) + low
     eyes = ((center + offsets)[:, None] + lifts[:, None] * up).reshape(-1, 3)
-    clearance = torch.cdist(eyes, points).amin(dim=1)
-    best = eyes[clearance.argmax()]
-    if float(clearance.amax()) < FREE or hidden_share(best, points) > _HIDDEN:
+    best = _freest(eyes, points)
+    if best is None:
         return None, None
     place = frame.center + frame.radius * best
     if size_growths(sized, place[None], frame.radius, least_cells=_LEAST_CELLS)[0] < _GROWS:
@@ -93,16 +92,22 @@ def find_room(
     return None, best if least <= float(walls.double().mean()) <= most else None
 
 
+def _freest(eyes: Float[Tensor, "e 3"], points: Float[Tensor, "v 3"]) -> Tensor | None:
+    """Return the eye farthest from surfaces; None if these are near, or hide one another."""
+    clearance = torch.cdist(eyes, points).amin(dim=1)
+    best = eyes[clearance.argmax()]
+    is_free = float(clearance.amax()) >= FREE and hidden_share(best, points) <= _HIDDEN
+    return best if is_free else None
+
+
 def is_enclosed(points: Float[Tensor, "v 3"]) -> bool:
     """Return whether surfaces surround a free point near the middle, with little behind them."""
     if len(points) == 0:
         return False
     middle = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
     steps = torch.linspace(-0.3, 0.3, 5, dtype=points.dtype, device="cpu")
-    eyes = middle + torch.cartesian_prod(steps, steps, steps)
-    clearance = torch.cdist(eyes, points).amin(dim=1)
-    best = eyes[clearance.argmax()]
-    if float(clearance.amax()) < FREE or hidden_share(best, points) > _HIDDEN:
+    best = _freest(middle + torch.cartesian_prod(steps, steps, steps), points)
+    if best is None:
         return False
     up = points.new_tensor([0.0, 0.0, 1.0])
     return enclosure(best, points, up) + enclosure(best, points, -up) >= 2 * ENCLOSED
