@@ -69,7 +69,7 @@ def oldest(session: nox.Session) -> None:
 def newest(session: nox.Session) -> None:
     """Quick tests with the newest versions of all dependencies; needs uv.
 
-    ``nox -s newest --force-python 3.13`` uses another Python; for ``UV_TORCH_BACKEND`` see above.
+    ``nox -s newest --force-python 3.14`` uses another Python; for ``UV_TORCH_BACKEND`` see above.
     """
     session.install("-e", ".[test]")
     session.run(

@@ -59,7 +59,18 @@ def test_doctor_reports_a_working_machine(capsys):
     assert "300 generated Gaussians to 10%" in printed
     for step in ("generate", "simplify", "views", "render"):
         assert f"  {step} " in printed
-    assert printed.endswith("The default path works.\n")
+    assert "The default path works.\n" in printed
+
+
+@pytest.mark.usefixtures("_small")
+@pytest.mark.parametrize("layer", ["omp", "workqueue"])
+def test_doctor_says_that_openmp_is_missing(capsys, monkeypatch, layer):
+    numba = pytest.importorskip("numba")
+    monkeypatch.setattr(numba, "threading_layer", lambda: layer)
+    assert main(["doctor", "--device", "cpu"]) == 0
+    found = capsys.readouterr().out
+    assert ("numba finds no OpenMP" in found) == (layer == "workqueue")
+    assert ("libgomp1" in found) == (layer == "workqueue")
 
 
 @pytest.mark.usefixtures("_small")

@@ -25,6 +25,7 @@ def test_every_case_is_in_the_catalogue_and_states_its_source():
         name: value
         for name, value in vars(hard_cases).items()
         if callable(value) and getattr(value, "__module__", "") == "hard_cases"
+        if not name.startswith("__")
     }
     assert own == {name: make for name, make in CASES.items() if name != "ball"}
     assert len(own) >= 35

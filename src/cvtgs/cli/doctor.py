@@ -26,6 +26,11 @@ SEARCHES = {
 }
 """What each search for the nearest sites is."""
 
+WITHOUT_OPENMP = (
+    "numba finds no OpenMP, so it renders one image at a time. With the system's package "
+    "(libgomp1 on Debian and Ubuntu), presets that render are faster."
+)
+
 COUNT, RHO, SIDE = 20_000, 0.1, 256
 """The small run: Gaussians, ratio, and side of the square image in pixels."""
 
@@ -98,6 +103,11 @@ def doctor(options: argparse.Namespace) -> None:
             f"the default path does not work on {default}: {reason}; try cvtgs doctor --device cpu."
         ) from error
     say("The default path works.")
+    if cvtgs.rendering.choose_backend("auto", default)[0] == "numba":
+        from cvtgs.rendering.compiled import takes_several_loops
+
+        if not takes_several_loops():
+            say(WITHOUT_OPENMP)
 
 
 def _reason_without_gpu() -> str:

@@ -75,6 +75,8 @@ def check_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> No
     if fault is not None:
         raise _refusal(path, "have a valid name", fault)
     try:
+        with suppress(FileNotFoundError, NotADirectoryError):
+            target.lstat()  # since Python 3.14, exists() does not raise on a too long name
         if target.is_symlink():  # realpath follows all links but loops
             raise _refusal(path, "be a file", "a loop of symbolic links")
         if target.is_dir() or os.fspath(path).endswith(("/", os.sep)):

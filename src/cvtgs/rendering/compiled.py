@@ -61,13 +61,14 @@ def parallel(function: F) -> F:
 
     @wraps(function)
     def call(*arguments: Any) -> object:
-        with nullcontext() if _takes_several_loops() else _TURN, threads_of_torch():
+        with nullcontext() if takes_several_loops() else _TURN, threads_of_torch():
             return compiled(*arguments)
 
     return cast("F", call)
 
 
-def _takes_several_loops() -> bool:
+def takes_several_loops() -> bool:
+    """Return whether loops of several threads can run at once: numba must find OpenMP or TBB."""
     try:
         return bool(vars(numba)["threading_layer"]() != "workqueue")
     except ValueError:  # chosen in the first loop
@@ -82,7 +83,7 @@ def for_each_camera(
     Parts of an image, such as sorting, are computed by one thread. Where numba takes one loop at a
     time, each loop gets all threads instead.
     """
-    at_a_time = len(cameras) > 1 and _takes_several_loops()
+    at_a_time = len(cameras) > 1 and takes_several_loops()
     yield from in_threads(function, cameras, HOST) if at_a_time else map(function, cameras)
 
 
