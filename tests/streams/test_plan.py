@@ -14,6 +14,7 @@ from cvtgs.math.frames import robust_frame
 from cvtgs.streams import (
     StreamPlan,
     blocks,
+    geo_transform,
     plan_stream,
     sog,
     stream_file,
@@ -207,5 +208,6 @@ def test_a_tile_above_blocks_has_an_error_of_its_diagonal_at_least() -> None:
     """So a viewer that is inside its box always loads the blocks."""
     for error, wanted in ((1.0, 5.0), (7.0, 7.0)):
         corners = (0.0, 0.0, 0.0), (3.0, 4.0, 0.0)
-        found = vars(tiles)["_parent"](*corners, [{"geometricError": error}])
+        child = {"geometricError": error, "transform": geo_transform(0.0, 0.0)}
+        found = vars(tiles)["_parent"](*corners, [child])
         assert found["geometricError"] == wanted

@@ -260,29 +260,20 @@ def test_wrong_levels_and_chunk_sizes_are_refused(levels: tuple[Level, ...]) -> 
         plan_stream(levels, chunk_gaussians=0)
 
 
-def test_the_transform_of_a_place_on_earth() -> None:
-    """At 90 degrees east on the equator, east is -x, north is z, and up is y."""
-    matrix = torch.tensor(geo_transform(90.0, 0.0, 100.0), dtype=torch.float64).reshape(4, 4).T
-    wanted = [[-1, 0, 0, 0], [0, 0, 1, 6378237], [0, 1, 0, 0], [0, 0, 0, 1]]
-    torch.testing.assert_close(matrix, torch.tensor(wanted, dtype=torch.float64))
-    pole = geo_transform(0.0, 90.0)
-    assert pole[14] == pytest.approx(6356752.314245, abs=1e-6)
-    # the example of EPSG method 9602: 53 48' 33.820" N, 2 07' 46.380" E, 73 m
-    north, east = 53 + 48 / 60 + 33.820 / 3600, 2 + 7 / 60 + 46.380 / 3600
-    assert geo_transform(east, north, 73.0)[12:15] == pytest.approx(
-        (3771793.968, 140253.342, 5124304.349), abs=2e-3
-    )
-    for wrong in ((0.0, 91.0), (400.0, 0.0), (0.0, math.nan)):
-        with pytest.raises(InvalidArgumentError, match="a latitude from -90 to 90"):
-            geo_transform(*wrong)
-
-
 def test_the_transform_of_tiles_is_written_and_checked(plan: StreamPlan, tmp_path: Path) -> None:
     place = geo_transform(8.5, 47.4, 400.0)
     write_tiles(plan, tmp_path / "a", transform=place)
-    assert json.loads((tmp_path / "a" / "tileset.json").read_text())["root"]["transform"] == [
-        *place
-    ]
+    write_tiles(plan, tmp_path / "unplaced")
+    placed, unplaced = (
+        json.loads((tmp_path / name / "tileset.json").read_text())["root"]
+        for name in ("a", "unplaced")
+    )
+    one, other = (
+        torch.tensor(of, dtype=torch.float64).view(4, 4).T for of in (place, unplaced["transform"])
+    )
+    wanted = (one @ other).T.flatten().tolist()
+    assert placed["transform"] == pytest.approx(wanted)
+    assert placed["children"] == unplaced["children"]
     wrongs: list[Any] = [(1.0,) * 3, (0.0,) * 15 + (1.0,), (1.0,) * 16, "1,0", 3, torch.eye(4)]
     for wrong in wrongs:
         with pytest.raises(InvalidArgumentError, match="must be 16 finite numbers"):

@@ -54,13 +54,15 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
     place.add_argument(
         "--place",
         metavar="LON,LAT[,H]",
-        help="longitude, latitude (degrees) and height (metres) of the origin of 3D Tiles, with "
-        "x to the east and z up",
+        help="longitude, latitude (degrees) and height (metres) of the origin of 3D Tiles; the "
+        "scene's right points east, its forward north (a PLY of x east, y north, z up needs "
+        "--axes rfu)",
     )
     place.add_argument(
         "--transform",
         metavar="N,N,...",
-        help="column-major transform of the root of 3D Tiles, instead of --place",
+        help="column-major transform of 3D Tiles instead of --place, from x left, y back and z "
+        "up in the scene",
     )
     add_block_options(parser)
 

@@ -211,7 +211,8 @@ def dropped_within(scene: GaussianScene, limits: FormatLimits) -> dict[str, int]
         if largest / SPZ_STEPS > _USUAL_SPZ_STEP:
             step = max(step, coarse_step(scene, largest / SPZ_STEPS))
     if step > 0:
-        dropped[f"{LOST_DIGITS} (steps of {step:.3g} so far from the origin)"] = 0
+        far = f"steps of {step:.3g} so far from the origin; convert --translate moves a scene"
+        dropped[f"{LOST_DIGITS} ({far})"] = 0
     for name, (low, high) in ranges.items():
         held = REST_COUNTS[limits.sh_degree] if name == "shN" else None
         values = getattr(scene, name)[:, :held][rows]

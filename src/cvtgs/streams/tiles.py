@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from cvtgs.boxes import Corner
 from cvtgs.checks import checked
@@ -34,6 +36,8 @@ TILE_GAUSSIANS = 1 << 16
 EARTH_RADIUS, FLATTENING = 6378137.0, 1 / 298.257223563
 """Equatorial radius, metres, and flattening of WGS 84."""
 
+_UNMOVED = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
 ERROR_PIXELS = 16.0
 """By default, viewers refine a tile whose error covers more pixels than this. Tile errors are
 multiplied by it, so that viewers refine where Gaussians are off by one pixel."""
@@ -41,7 +45,11 @@ multiplied by it, so that viewers refine where Gaussians are off by one pixel.""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Tile:
-    """A tile: consecutive chunks at one level, and the finer tiles that replace it."""
+    """A tile: consecutive chunks at one level, and the finer tiles that replace it.
+
+    Its positions and its box are relative to its origin, so that they keep their digits far from
+    the origin of the scene.
+    """
 
     node: StreamNode
     level: int
@@ -55,8 +63,8 @@ class TilesFormat:
 
     Attributes:
         tile_gaussians: Maximum number of Gaussians in a tile; a chunk is never split.
-        transform: Root transform from the axes of the tileset (z up, metres) to its place, 16
-            numbers column by column; None for no transform.
+        transform: Transform from the axes of the tileset (z up, metres) to its place, 16 numbers
+            column by column; None for no transform.
         kind: Name of the format.
     """
 
@@ -72,12 +80,18 @@ class TilesFormat:
         tiles = list(_listed(root))
         names = {id(tile): f"{part}_{number}.glb" for number, tile in enumerate(tiles)}
         counts, files, sizes = ([0] * len(plan.levels) for _ in range(3))
+        origins: dict[int, Corner] = {}
         dropped = Counter[str]()
         for number, tile in enumerate(tiles):
             scene = plan.levels[tile.level].scene
             rows = torch.cat([plan.chunks[chunk].rows[tile.level] for chunk in tile.chunks])
             some = tagged_if_flat(scene.select(rows.to(scene.device)))
-            turned = change_axes(some, SCENE_AXES, AXES)
+            means = some.means.detach().double()
+            origins[id(tile)] = _median(means)
+            local = means - means.new_tensor(origins[id(tile)])
+            turned = change_axes(
+                some.with_tensors({"means": local.to(some.dtype)}), SCENE_AXES, AXES
+            )
             path = folder / names[id(tile)]
             with atomic_output(path, overwrite=True) as file:
                 write_spz_glb(turned, file)
@@ -90,7 +104,7 @@ class TilesFormat:
             levels=tuple(StreamLevel(*three) for three in zip(counts, files, sizes, strict=True)),
             chunks=len(plan.chunks),
             names=tuple(names.values()),
-            tree=_entry(plan, root, names),
+            tree=_entry(plan, root, names, origins),
             box_min=plan.root.box_min,
             box_max=plan.root.box_max,
             dropped=dropped,
@@ -100,14 +114,14 @@ class TilesFormat:
         """Return the content of ``tileset.json``; tiles share no other file."""
         low, high = join_boxes((part.box_min, part.box_max) for part in parts)
         root = join_trees(parts, lambda part: parts[part].tree, _parent)
-        placed = {} if self.transform is None else {"transform": list(self.transform)}
+        placed = _relative(root, _matrix(_UNMOVED if self.transform is None else self.transform))
         extensions = {"extensionsUsed": [SPLATS, SPZ], "extensionsRequired": [SPLATS, SPZ]}
         return {
             "asset": {"version": "1.1", "generator": "cvtgs"},
             "extensionsUsed": ["3DTILES_content_gltf"],
             "extensions": {"3DTILES_content_gltf": extensions},
             "geometricError": max(root["geometricError"], math.dist(low, high)),
-            "root": {"refine": "REPLACE", **placed, **root},
+            "root": {"refine": "REPLACE", **placed},
         }
 
 
@@ -126,14 +140,17 @@ def write_tiles(
 
     The root holds the coarsest level of the whole scene. Finer tiles of its parts replace a tile,
     down to the finest level of single chunks. Tiles use the axes of glTF, and boxes use those of
-    3D Tiles (z up). All files are written, or none.
+    3D Tiles (z up). Both are relative to the transform of the tile, which moves the median of its
+    positions into place, so that they keep their digits far from the origin. All files are
+    written, or none.
 
     Args:
         plan: Levels and chunks.
         folder: Folder to write to; created if it is missing.
         tile_gaussians: Maximum number of Gaussians in a tile; a chunk is never split.
-        transform: Root transform of the tileset, 16 numbers column by column, as returned by
-            :func:`geo_transform`; None for no transform.
+        transform: Transform of the tileset, 16 numbers column by column, as returned by
+            :func:`geo_transform`: from x left, y back and z up in the scene to its place; None for
+            no transform.
         overwrite: Whether files of an earlier stream may be replaced.
         listener: Called after each tile.
 
@@ -171,8 +188,9 @@ def write_tiles(
 def geo_transform(longitude: float, latitude: float, height: float = 0.0) -> tuple[float, ...]:
     """Return the transform that places a tileset on the Earth.
 
-    The tileset's x axis points east, y north and z up, in metres. The ellipsoid is that of WGS 84
-    (EPSG 4978).
+    The scene's right (x of a PLY) points east, its forward (z) north and its up (-y) up, in metres.
+    As glTF and thus the tileset have x to the left, x of the tileset points west, and y south. The
+    ellipsoid is that of WGS 84 (EPSG 4978).
 
     Args:
         longitude: Degrees, east is positive.
@@ -203,8 +221,8 @@ def geo_transform(longitude: float, latitude: float, height: float = 0.0) -> tup
     squared = FLATTENING * (2.0 - FLATTENING)
     across = EARTH_RADIUS / math.sqrt(1.0 - squared * sin_north**2)
     return (
-        -sin_east, cos_east, 0.0, 0.0,
-        -sin_north * cos_east, -sin_north * sin_east, cos_north, 0.0,
+        sin_east, -cos_east, 0.0, 0.0,
+        sin_north * cos_east, sin_north * sin_east, -cos_north, 0.0,
         cos_north * cos_east, cos_north * sin_east, sin_north, 0.0,
         (across + height) * cos_north * cos_east, (across + height) * cos_north * sin_east,
         (across * (1.0 - squared) + height) * sin_north, 1.0,
@@ -281,32 +299,64 @@ def _listed(tile: _Tile) -> Iterator[_Tile]:
         yield from _listed(child)
 
 
-def _entry(plan: StreamPlan, tile: _Tile, names: dict[int, str]) -> dict[str, Any]:
+def _entry(
+    plan: StreamPlan, tile: _Tile, names: dict[int, str], origins: dict[int, Corner]
+) -> dict[str, Any]:
+    """Return a tile, with the origin of each tile in the axes of 3D Tiles as its transform."""
     # finer tiles never have larger errors
     error = max(level.geometric_error for level in plan.levels[: tile.level + 1])
     entry: dict[str, Any] = {
-        "boundingVolume": {"box": _box(tile.node.box_min, tile.node.box_max)},
+        **_located(tile.node.box_min, tile.node.box_max, origins[id(tile)]),
         "geometricError": ERROR_PIXELS * error if tile.children else 0.0,
         "content": {"uri": names[id(tile)]},
     }
     if tile.children:
-        entry["children"] = [_entry(plan, child, names) for child in tile.children]
+        entry["children"] = [_entry(plan, child, names, origins) for child in tile.children]
     return entry
 
 
 def _parent(low: Corner, high: Corner, children: list[dict[str, Any]]) -> dict[str, Any]:
     """Return a tile without content, which viewers always refine."""
     errors = [child["geometricError"] for child in children]
+    x, y, z = _median(torch.stack([_matrix(child["transform"])[:3, 3] for child in children]))
     return {
-        "boundingVolume": {"box": _box(low, high)},
+        **_located(low, high, (-x, -z, -y)),
         "geometricError": max(math.dist(low, high), *errors),
         "children": children,
     }
 
 
-def _box(low: Corner, high: Corner) -> Sequence[float]:
-    """Return a box in the axes of 3D Tiles: x is left, y back and z up in the scene."""
-    corners = [(-x, -z, -y) for x, y, z in (low, high)]
-    middle = [(a + b) / 2 for a, b in zip(*corners, strict=True)]
+def _located(low: Corner, high: Corner, origin: Corner) -> dict[str, Any]:
+    """Return the box of a tile, and the translation to its origin, both in the axes of 3D Tiles.
+
+    In them, x is left, y back and z up in the scene.
+    """
+    start, *corners = ((-x, -z, -y) for x, y, z in (origin, low, high))
+    middle = [(a + b) / 2 - o for o, a, b in zip(start, *corners, strict=True)]
     half = [abs(a - b) / 2 for a, b in zip(*corners, strict=True)]
-    return [*middle, half[0], 0.0, 0.0, 0.0, half[1], 0.0, 0.0, 0.0, half[2]]
+    box = [*middle, half[0], 0.0, 0.0, 0.0, half[1], 0.0, 0.0, 0.0, half[2]]
+    return {"transform": [*_UNMOVED[:12], *start, 1.0], "boundingVolume": {"box": box}}
+
+
+def _relative(tile: dict[str, Any], above: Float[Tensor, "4 4"]) -> dict[str, Any]:
+    """Return a tile whose transforms, and those below, go to the axes of its parent.
+
+    ``above`` is the transform to these axes.
+    """
+    own = _matrix(tile["transform"])
+    inverse = 2 * _matrix(_UNMOVED) - own  # of a translation
+    moved = {**tile, "transform": (above @ own).T.flatten().tolist()}
+    if "children" in tile:
+        moved["children"] = [_relative(child, inverse) for child in tile["children"]]
+    return moved
+
+
+def _matrix(numbers: Sequence[float]) -> Float[Tensor, "4 4"]:
+    return torch.tensor(numbers, dtype=torch.float64, device="cpu").reshape(4, 4).T
+
+
+def _median(positions: Float[Tensor, "n 3"]) -> Corner:
+    """Return the median of finite positions along each axis; a mean could be far from all."""
+    finite = positions[positions.isfinite().all(dim=1)]
+    x, y, z = finite.median(dim=0).values.tolist() if len(finite) else (0.0, 0.0, 0.0)
+    return x, y, z
