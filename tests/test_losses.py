@@ -270,3 +270,13 @@ def test_autocast_does_not_change_losses(loss) -> None:
     assert found.dtype == torch.float32
     assert torch.equal(found, wanted)
     assert torch.equal(torch.autograd.grad(found, prediction)[0], slope)
+
+
+@pytest.mark.parametrize("bright", [0.9, 1.0])
+@pytest.mark.parametrize("dark", [0.1, 0.9])
+def test_ssim_of_even_images_is_no_rounding_error(bright, dark):
+    """Variances are differences of squares, 0.8 here, beside a constant of 0.0009."""
+    one = torch.full((1, 32, 32, 3), bright)
+    one[:, :16] = dark
+    found, exact = (float(mean_ssim(image, image - 1e-3)) for image in (one, one.double()))
+    assert found == pytest.approx(exact, abs=1e-4 if dark != bright else 2e-6)

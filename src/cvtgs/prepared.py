@@ -234,7 +234,7 @@ class Prepared:
         valid = checked.scene
         is_whole = target >= len(valid)
         if self._cameras is not None and self._config.uses_images and not is_whole:
-            from cvtgs.evaluation.compare import check_seen  # noqa: PLC0415 (few give cameras)
+            from cvtgs.evaluation.blind_views import check_seen  # noqa: PLC0415 (few give cameras)
 
             check_seen(valid, self._cameras, name="the scene")
         with clock.stage("plan"):

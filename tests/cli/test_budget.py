@@ -1,6 +1,7 @@
 """Goals on the command line: valid combinations, time budgets, and printed notes."""
 
 import argparse
+import json
 import re
 import shutil
 import time
@@ -229,17 +230,50 @@ def test_a_target_is_measured_over_the_views_of_evaluate(source, capsys):
 
 
 @pytest.mark.parametrize(
-    ("preset", "is_given", "views"),
+    ("preset", "beside", "given", "scored", "views"),
     [
-        ("draft", False, "automatic views"),
-        ("draft", True, "the given cameras"),
-        ("high", True, "automatic views that it was not fitted to"),
+        ("draft", 0, 0, 0, "automatic views"),
+        ("draft", 12, 0, 8, "8 cameras found in {}"),
+        ("draft", 12, 3, 3, "the given cameras"),
+        ("high", 12, 0, 0, "automatic views that it was not fitted to"),
+        ("high", 0, 3, 0, "automatic views that it was not fitted to"),
     ],
 )
-def test_the_views_of_a_target_are_named(scene, preset, is_given, views):
-    found = Found(scene, None, 30.0, 0.9, 0.1, -0.1, tried=())
-    config = cvtgs.SimplifyConfig.from_preset(preset)
-    assert f" over {views}; found" in target_note(found, config, is_given=is_given)
+def test_a_target_is_measured_over_the_views_of_evaluate_which_are_named(  # noqa: PLR0917
+    source, scene, monkeypatch, preset, beside, given, scored, views
+):
+    """Presets that use images are fitted to these."""
+    heldout: list[cvtgs.Cameras | None] = []
+
+    def find_count(*_, **settings):
+        heldout.append(settings["heldout"])
+        return Found(scene, None, 30.0, 0.9, 0.1, -0.1, tried=())
+
+    monkeypatch.setattr(cvtgs.budget, "find_count", find_count)
+    path = source.with_name("transforms.json")
+    if beside:
+        poses = [
+            [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4 + row / 4], [0, 0, 0, 1]]
+            for row in range(beside)
+        ]
+        frames = [{"file_path": f"{r}.png", "transform_matrix": p} for r, p in enumerate(poses)]
+        path.write_text(json.dumps({"w": 48, "h": 36, "fl_x": 40.0, "frames": frames}))
+    cameras = cvtgs.views.automatic_views(scene, given) if given else None
+    asked = options("--target-psnr", "30")
+    asked.input, asked.output = source, Path("a.ply")
+    settings = {"cameras": cameras, "axes": None, "listener": silent}
+    _, note = search_target(asked, scene, cvtgs.Simplifier(preset=preset), **settings)
+    assert f" over {views.format(path.resolve().parent)}; found" in note
+    (found,) = heldout
+    assert len(found or ()) == scored
+    if scored == 8:
+        assert (found.width, found.height) == (640, 480)
+
+
+def test_a_psnr_at_its_limit_is_at_least_that(scene):
+    found = Found(scene, None, 60.0, 1.0, 0.0, 0.0, tried=())
+    assert target_note(found, "views").startswith("PSNR at least 60.00 dB, SSIM 1.0000")
+    assert target_note(found._replace(psnr=59.994), "views").startswith("PSNR 59.99 dB")
 
 
 def test_shipped_rates_need_no_measurement(scene, measured, capsys):
@@ -301,7 +335,12 @@ def test_a_target_is_measured_on_the_file_and_over_views_that_nothing_was_fitted
     views: str | None,
 ) -> None:
     given: dict[str, Any] = {}
-    monkeypatch.setattr("cvtgs.budget.find_count", lambda _, **options: given.update(options))
+
+    def find_count(_: cvtgs.GaussianScene, **options: Any) -> Found:
+        given.update(options)
+        return Found(scene, cast("Any", None), 30.0, 0.9, 0.1, -0.1, tried=())
+
+    monkeypatch.setattr("cvtgs.budget.find_count", find_count)
     known, cameras = options("--target-psnr", "20"), cast("Any", "the given ones")
     known.output = Path(name)
     simplifier = cvtgs.Simplifier(preset=preset, device="cpu")

@@ -1,6 +1,7 @@
 """Numbers and names on sheets and pages, in JSON and in errors."""
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import pytest
 from cvtgs import Cameras, evaluate, refine
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import EvaluationSettings, compare, comparison_files
+from cvtgs.evaluation.scorer import Score
 from refine_cases import ring
 from scenes import random_scene
 
@@ -26,6 +28,18 @@ from scenes import random_scene
 )
 def test_ratios_as_text(ratio, text):
     assert vars(comparison_files)["_ratio_text"](ratio) == text
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ([20.0, 30.0], "25.00 dB"),
+        ([math.inf, math.inf], "equal"),
+        ([20.0, math.inf, 31.0], "25.50 dB, 1 equal"),
+    ],
+)
+def test_a_mean_is_equal_only_if_all_views_are(values, text):
+    assert vars(comparison_files)["_mean_psnr_text"](Score.of(values)) == text
 
 
 def test_names_of_images_that_are_not_utf_8_are_escaped() -> None:

@@ -20,7 +20,7 @@ from cvtgs.evaluation import (
     psnr,
     ssim,
 )
-from cvtgs.evaluation.compare import check_seen
+from cvtgs.evaluation.blind_views import check_seen
 from cvtgs.losses import ssim_loss
 from cvtgs.views import automatic_views
 from scenes import random_scene

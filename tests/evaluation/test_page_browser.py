@@ -1,7 +1,9 @@
 """The page in a real browser: its script, its layout on a phone, and no network requests."""
 
+import math
 import re
 import subprocess
+from dataclasses import replace
 
 import pytest
 import torch
@@ -18,6 +20,7 @@ from browser_cases import (
     text_of,
 )
 from cvtgs.evaluation import EvaluationSettings, compare, write_comparison
+from cvtgs.evaluation.scorer import Score
 from cvtgs.views import automatic_views
 
 pytestmark = needs_browser
@@ -159,3 +162,15 @@ def test_a_screenshot_shows_both_scenes(page):
     shot = path.parent / "shot.png"
     browse(path, "#split=50", "--window-size=1000,900", f"--screenshot={shot}")
     assert shot.stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_a_mean_over_some_equal_views_is_that_of_the_others(tmp_path):
+    scene = cvtgs.synthetic.scene("object", 300, sh_degree=0, seed=0)
+    views = automatic_views(scene, 3, width=64, height=48)
+    comparison = compare(scene, {"a": scene}, views, settings=EvaluationSettings(lpips="off"))
+    (same,) = comparison.evaluation.scenes
+    mixed = same.model_copy(update={"psnr": Score.of([20.0, math.inf, 31.0])})
+    evaluation = comparison.evaluation.model_copy(update={"scenes": (mixed,)})
+    write_comparison(replace(comparison, evaluation=evaluation), tmp_path)
+    assert dom(tmp_path / "index.html").count("25.50 dB, 1 equal") == 2  # the choice and the table

@@ -59,12 +59,28 @@ def test_a_suffix_may_start_with_a_capital(tmp_path):
     assert load_photographs(tmp_path, one).shape == (1, 8, 8, 3)
 
 
-def test_an_image_of_floats_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("dtype", "kind"), [(np.float32, "floats"), (np.int32, "integers of 32 bits")]
+)
+def test_images_whose_white_is_unknown_are_refused(tmp_path, dtype, kind):
     from PIL import Image  # noqa: PLC0415
 
-    Image.fromarray(np.full((16, 16), 0.5, dtype=np.float32)).save(tmp_path / "a.tif")
-    with pytest.raises(FileFormatError, match=r"a\.tif: must hold whole numbers, found an image"):
+    Image.fromarray(np.full((16, 16), 1, dtype=dtype)).save(tmp_path / "a.tif")
+    with pytest.raises(FileFormatError, match=rf"a\.tif: must have 8 or 16 bits.*, found {kind}"):
         read_image(tmp_path / "a.tif", (16, 16), (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_the_transparent_value_of_a_grey_image_shows_the_background(tmp_path, dtype):
+    from PIL import Image  # noqa: PLC0415
+
+    white = int(np.iinfo(dtype).max)
+    values = np.zeros((8, 8), dtype=dtype)
+    values[:, 4:] = white
+    Image.fromarray(values).save(tmp_path / "a.png", transparency=white)
+    found = read_image(tmp_path / "a.png", (8, 8), (0.0, 1.0, 0.5))
+    assert found[:, :4].max() == 0.0
+    assert found[0, 7].tolist() == [0.0, 1.0, 0.5]
 
 
 def test_upright_photographs_may_have_pixels_that_are_not_quite_square(tmp_path):

@@ -14,7 +14,7 @@ from cvtgs.analysis.analyze import measure_contributions
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.edit import Motion, move
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.evaluation.compare import check_seen
+from cvtgs.evaluation.blind_views import check_seen
 from cvtgs.rendering import blending_weights, contributions, error_shares, observe, render
 from cvtgs.synthetic import demo_scene
 from cvtgs.views import automatic_views, mixed_views

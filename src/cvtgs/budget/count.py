@@ -12,8 +12,8 @@ from cvtgs.checks import checked
 from cvtgs.clock import check_listener
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import real_number, target_count
-from cvtgs.errors import GoalError, InvalidArgumentError, InvalidSceneError
-from cvtgs.evaluation.compare import check_seen
+from cvtgs.errors import GoalError, InvalidArgumentError, InvalidSceneError, warn
+from cvtgs.evaluation.blind_views import check_seen, shows
 from cvtgs.evaluation.scorer import MOST_PSNR, Metrics, Scorer, scene_scores
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import SearchReport, Simplified, SimplifyReport, Tried
@@ -118,7 +118,8 @@ def find_count(
     """Find the smallest number of Gaussians that reaches a quality, to within 3 %.
 
     Quality is measured over the eight automatic views of ``cvtgs evaluate``; for presets that use
-    images, over eight others, which no preset uses. The full scene is rendered, checked and
+    images, over eight others, which no preset uses. Views that show nothing of the scene are left
+    out. The full scene is rendered, checked and
     analyzed once; a search takes six to ten simplifications. If quality does not rise
     monotonically with the count, a smaller count may also reach it.
 
@@ -211,12 +212,21 @@ def heldout_scorer(full: GaussianScene, cameras: Cameras, *, listener: ProgressL
     if total == 0:
         raise InvalidArgumentError("heldout must hold at least one camera, found none.")
     check_seen(full, cameras, name="the scene")
-    return Scorer(
+    scorer = Scorer(
         full,
         cameras.singles(),
         metrics=Metrics(most_psnr=MOST_PSNR),
+        counts=lambda truth: shows(full, truth.cameras, truth.alpha),
         progress=lambda done: listener(ProgressEvent(stage="look", done=done, total=total)),
     )
+    if len(scorer) == 0:
+        raise InvalidArgumentError("heldout must show something of the scene, found nothing.")
+    if len(scorer) < total:
+        warn(
+            f"{total - len(scorer)} of {total} views show nothing of the scene, so quality is "
+            f"measured over the others."
+        )
+    return scorer
 
 
 def heldout_quality(scorer: Scorer, small: GaussianScene, *, count: int) -> Tried:

@@ -130,8 +130,8 @@ def choose_cameras(
     if cameras is not None:
         cameras = cameras.spread(options.views or most or len(cameras))
         images = getattr(options, "images", None)
-        if images is not None and options.size is None:
-            return cvtgs.evaluation.fit_cameras(cameras, images)
+        if images is not None:  # also checks their aspect ratio
+            cameras = cvtgs.evaluation.fit_cameras(cameras, images)
         return cameras if options.size is None else cameras.fitted(size)
     path = options.reference if "reference" in options else options.input
     own = own_cameras(options, scene, path)

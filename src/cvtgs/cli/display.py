@@ -13,7 +13,6 @@ from cvtgs.text import columns, counted, padded, printable
 
 if TYPE_CHECKING:
     from cvtgs.budget import Found
-    from cvtgs.config import SimplifyConfig
     from cvtgs.report import SimplifyReport
 
 WIDTH = 80  # maximum columns of a line of output
@@ -102,15 +101,15 @@ def progress_bars(*, quiet: bool, transient: bool = False) -> Iterator[ProgressL
         yield listen
 
 
-def target_note(found: "Found", config: "SimplifyConfig", *, is_given: bool) -> str:
+def target_note(found: "Found", views: str) -> str:
     """Return the scores of a search, and the views that they are measured over."""
-    views = "the given cameras" if is_given else "automatic views"
-    if config.uses_images:
-        views = "automatic views that it was not fitted to"
+    from cvtgs.evaluation.scorer import MOST_PSNR
+
     tries = "1 try" if len(found.tried) == 1 else f"{len(found.tried)} tries"
+    least = "at least " if found.psnr == MOST_PSNR else ""  # closer views count no more
     return (
-        f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f}, alpha error {found.alpha_error:.4f} "
-        f"(bias {found.alpha_bias:+.4f}) over {views}; found in {tries}."
+        f"PSNR {least}{found.psnr:.2f} dB, SSIM {found.ssim:.4f}, alpha error "
+        f"{found.alpha_error:.4f} (bias {found.alpha_bias:+.4f}) over {views}; found in {tries}."
     )
 
 

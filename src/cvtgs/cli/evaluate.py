@@ -55,7 +55,7 @@ def render(options: argparse.Namespace) -> None:
     import torch
 
     from cvtgs.devices import chosen_device
-    from cvtgs.evaluation.compare import LEAST_COVER
+    from cvtgs.evaluation.blind_views import LEAST_COVER
     from cvtgs.evaluation.images import as_bytes, encode
     from cvtgs.io.atomic import make_folder
 

@@ -9,8 +9,10 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, NamedTuple
 
 import cvtgs
-from cvtgs.cli.display import say
+from cvtgs.cli.cameras import AUTOMATIC_VIEWS, SCORED_SIZE, own_cameras
+from cvtgs.cli.display import say, target_note
 from cvtgs.errors import DroppedDataWarning, GoalError, InvalidArgumentError, without_warnings
+from cvtgs.text import counted
 
 if TYPE_CHECKING:
     from cvtgs.budget import Found
@@ -139,9 +141,23 @@ def search_target(
     cameras: "Cameras | None",
     axes: str | None,
     listener: "ProgressListener",
-) -> "Found":
-    """Search for the smallest scene whose file, with the given axes, reaches the quality."""
+) -> tuple["Found", str]:
+    """Search for the smallest scene whose file, with the given axes, reaches the quality.
+
+    Without ``--cameras``, the views are those of ``cvtgs evaluate``, unless a preset is fitted to
+    them. Returns the scene, and the sentence about its scores.
+    """
     is_rounded = rounds(options.output)
+    heldout, views = cameras, "the given cameras"
+    if simplifier.config.uses_images:
+        heldout, views = None, "automatic views that it was not fitted to"
+    elif cameras is None:
+        own = own_cameras(options, scene, options.input)
+        if own is None:
+            views = "automatic views"
+        else:
+            heldout = own.cameras.spread(AUTOMATIC_VIEWS).fitted(SCORED_SIZE)
+            views = f"{counted(len(heldout), 'camera')} found in {own.source.resolve()}"
 
     def read_back(small: "GaussianScene") -> "GaussianScene":
         """Write a scene to a temporary file of the format of OUT, and read it again."""
@@ -152,13 +168,13 @@ def search_target(
             return cvtgs.io.load(file, device=small.device, axes=axes, trust_sizes=True)
 
     try:
-        return cvtgs.budget.find_count(
+        found = cvtgs.budget.find_count(
             scene,
             psnr=options.target_psnr,
             ssim=options.target_ssim,
             simplifier=simplifier,
             cameras=cameras,
-            heldout=None if simplifier.config.uses_images else cameras,
+            heldout=heldout,
             written=read_back if is_rounded else lambda small: small,
             listener=listener,
         )
@@ -169,6 +185,7 @@ def search_target(
             f"{error} These are scores of files of this format, which rounds; a plain .ply does "
             f"not."
         ) from error
+    return found, target_note(found, views)
 
 
 def rounds(path: Path) -> bool:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import cvtgs
 from cvtgs.cli.blocks import add_block_options, block_workers, check_block_device, memory_of
 from cvtgs.cli.cameras import check_split, own_cameras, read_cameras
-from cvtgs.cli.display import TIE, progress_bars, report_notes, target_note
+from cvtgs.cli.display import TIE, progress_bars, report_notes
 from cvtgs.cli.goals import (
     STARTED,
     check_goals,
@@ -267,13 +267,13 @@ def _simplify_in_memory(
         checkpoint, config=config, device=options.device, listener=silent if search else listener
     )
     if search:
-        found = search_target(
+        found, scores = search_target(
             options, scene, simplifier, cameras=cameras, axes=axes.target, listener=listener
         )
         small, report = found.scene, found.report
         if isinstance(config.effects.sh, int):
             small = small.with_sh_degree(config.effects.sh)
-        notes.append(target_note(found, config, is_given=options.cameras is not None))
+        notes.append(scores)
     else:
         keep = None
         if options.keep is not None:

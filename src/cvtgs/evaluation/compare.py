@@ -14,6 +14,7 @@ from cvtgs.checks import check_kinds
 from cvtgs.clock import check_listener
 from cvtgs.counts import checked_whole, spread_rows
 from cvtgs.errors import InvalidArgumentError, warn
+from cvtgs.evaluation.blind_views import check_seen, shows
 from cvtgs.evaluation.images import as_bytes
 from cvtgs.evaluation.scorer import (
     Evaluation,
@@ -25,17 +26,12 @@ from cvtgs.evaluation.scorer import (
     render_views,
     scene_scores,
 )
-from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.rendering import BackendName, choose_backend
-from cvtgs.rendering.projection import to_matrices, warn_of_near_plane
+from cvtgs.rendering import choose_backend
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.text import printable_name, short_repr, shown
 
 STAGE = "evaluate"  # stage name in progress events; one step per image
-PREVIEW = 96  # longer side of images that only tell whether they show anything, pixels
-SAMPLED = 4096  # about how many Gaussians tell whether a camera sees anything of a scene
-LEAST_COVER = 1e-4  # mean alpha that one image must reach if all centres are outside every image
 ROUNDING = 1e-3  # values of photographs may be outside [0, 1] by this much, as in half precision
 
 Images = UInt8[np.ndarray, "c h w 3"]
@@ -103,7 +99,8 @@ def evaluate(
 ) -> Evaluation:
     """Score the images of simplified scenes.
 
-    Each view of the full scene is rendered once for all simplified scenes. Memory: that of
+    Each view of the full scene is rendered once for all simplified scenes. Views that show nothing
+    of it do not count in mean scores against it, and a warning tells their number. Memory: that of
     :func:`cvtgs.rendering.render`, and two images.
 
     Args:
@@ -122,6 +119,7 @@ def evaluate(
         InvalidArgumentError: There is no camera, or none sees anything of the full scene; two
             scenes share a name, or the photographs do not have the shape of the images or are no
             floats in [0, 1].
+        InvalidSceneError: The full scene has no Gaussian.
         DeviceError: The backend does not work on a scene's device.
         MissingDependencyError: The backend's package or the chosen LPIPS is missing.
 
@@ -254,47 +252,6 @@ def _check_photographs(photographs: Float[Tensor, "c h w 3"], cameras: Cameras) 
         )
 
 
-def check_seen(
-    scene: GaussianScene,
-    cameras: Cameras,
-    *,
-    name: str,
-    backend: BackendName = "auto",
-    is_sample: bool = False,
-) -> None:
-    """Raise if no camera sees anything of a scene, or one is no pinhole camera.
-
-    Warn if few see anything, or if the near plane hides much. A sample of a scene cannot tell that
-    a camera sees nothing, so there is no warning of that.
-    """
-    to_matrices(cameras)  # alone, each would be "camera 0" in errors
-    warn_of_near_plane(scene, cameras.singles(), name=name)
-    is_drawn = scene.opacities >= MIN_ALPHA
-    points = scene.means[is_drawn] if bool(is_drawn.any()) else scene.means
-    blind = cameras.to("cpu").singles()
-    for some in (points[:: -(-len(points) // SAMPLED)].cpu(), points):  # all only in doubt
-        exact = some.double()
-        blind = [camera for camera in blind if not camera.shows_any(exact)]
-        if 2 * len(blind) <= len(cameras):
-            return
-    empty = sum(_is_empty(scene, camera.fitted(PREVIEW), backend) for camera in blind)
-    if empty == len(cameras):
-        raise InvalidArgumentError(
-            f"the cameras must see {name}, found nothing of it in any of {len(cameras)} "
-            f"views; give cameras of this scene, in its axes and units."
-        )
-    if 2 * empty > len(cameras) and not is_sample:
-        warn(
-            f"{empty} of {len(cameras)} cameras see nothing of {name}; give cameras of this "
-            f"scene, in its axes and units."
-        )
-
-
-def _is_empty(scene: GaussianScene, camera: Cameras, backend: BackendName) -> bool:
-    """Return whether an image shows nothing, though Gaussians beside it may reach into it."""
-    return float(render_views(scene, camera, backend=backend).alpha.mean()) < LEAST_COVER
-
-
 @torch.no_grad()
 def check_scores(
     scene: GaussianScene,
@@ -346,6 +303,7 @@ def _score_images(
     metrics = _checked_metrics(reference, cameras, photographs, settings, name=reference_name)
     against_full: dict[str, list[ImageScores]] = {name: [] for name in scenes}
     against_photographs: dict[str, list[ImageScores]] = {name: [] for name in scenes}
+    blind: list[int] = []
     total, done = len(cameras) * len(scenes), 0
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
     for view, camera in enumerate(cameras.singles()):
@@ -357,6 +315,8 @@ def _score_images(
             keep(name, view, color, alpha)
             if truth is None:
                 truth = color, alpha
+                if not shows(scene, camera, alpha):
+                    blind.append(view)
             else:
                 alphas = alpha, truth[1].to(alpha)
                 against_full[name].append(metrics.compare(color, truth[0], alphas=alphas))
@@ -366,6 +326,11 @@ def _score_images(
             done += 1
             listener(ProgressEvent(stage=STAGE, done=done, total=total))
     del against_full[reference_name]
+    if blind:
+        warn(
+            f"{len(blind)} of {len(cameras)} views show nothing of {reference_name}, so they do "
+            f"not count in mean scores."
+        )
     return Evaluation(
         reference=reference_name,
         reference_count=len(reference),
@@ -376,7 +341,8 @@ def _score_images(
         lpips_network=metrics.lpips.network if metrics.lpips else None,
         lpips_note=metrics.note,
         scenes=tuple(
-            scene_scores(name, len(scenes[name]), rows) for name, rows in against_full.items()
+            scene_scores(name, len(scenes[name]), rows, blind=blind)
+            for name, rows in against_full.items()
         ),
         photographs=tuple(
             scene_scores(name, len(scenes[name]), rows)

@@ -25,7 +25,7 @@ from cvtgs.evaluation.images import (
     error_map,
     resized,
 )
-from cvtgs.evaluation.scorer import SceneScores
+from cvtgs.evaluation.scorer import SceneScores, Score
 from cvtgs.io.atomic import check_outputs, write_atomically
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.text import counted, size_text
@@ -159,7 +159,7 @@ def _small_row(comparison: Comparison, scores: SceneScores, images: Images) -> _
         counted(scores.count, "Gaussian"),
         _ratio_text(comparison.ratio(scores)),
         _size_text(comparison, scores.name),
-        f"PSNR {_psnr_text(scores.psnr.mean)}",
+        f"PSNR {_mean_psnr_text(scores.psnr)}",
         f"SSIM {scores.ssim.mean:.3f}",
         f"LPIPS {scores.lpips.mean:.3f}" if scores.lpips else "",
         f"alpha error {scores.alpha_error.mean:.4f}" if scores.alpha_error else "",
@@ -237,6 +237,15 @@ def _shortened(text: str, width: int, font: "FreeTypeFont | ImageFont") -> str:
 
 def _psnr_text(value: float) -> str:
     return "equal" if math.isinf(value) else f"{value:.2f} dB"
+
+
+def _mean_psnr_text(psnr: Score) -> str:
+    """Return the mean; if only some views are equal, that of the others."""
+    finite = [value for value in psnr.views if math.isfinite(value)]
+    if math.isfinite(psnr.mean) or not finite:
+        return _psnr_text(psnr.mean)
+    others, equal = Score.of(finite).mean, len(psnr.views) - len(finite)
+    return f"{_psnr_text(others)}, {equal} equal"
 
 
 def _size_text(comparison: Comparison, name: str) -> str:

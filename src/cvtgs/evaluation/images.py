@@ -103,12 +103,16 @@ def read_image(
 
     with _opened(path), Image.open(path) as file:
         image: Image.Image = file
-        if file.mode.startswith("I"):  # grey of 16 bits, which convert would clip at 255
-            grey = np.asarray(file, dtype=np.float32) * (255 / 65535)
-            image = Image.fromarray(grey.round().clip(0, 255).astype(np.uint8))
-        whole, mode = image.convert("RGBA"), file.mode
-    if mode == "F":  # convert would make values from 0 to 1 black
-        raise FileFormatError(f"{path}: must hold whole numbers, found an image of floats.")
+        mode, kind = file.mode, file.format
+        if mode.startswith("I"):  # grey of 16 bits, which convert would clip at 255
+            values = np.asarray(file, dtype=np.float32)
+            grey = (values * (255 / 65535)).round().clip(0, 255)
+            shown = np.where(values == file.info.get("transparency", -1), 0, 255)
+            image = Image.fromarray(np.stack([grey, shown], axis=2).astype(np.uint8))  # LA
+        whole = image.convert("RGBA")
+    if mode == "F" or (mode == "I" and kind != "PNG"):  # whose white is unknown
+        found = "floats" if mode == "F" else "integers of 32 bits"
+        raise FileFormatError(f"{path}: must have 8 or 16 bits a channel, found {found}.")
     pixels = np.asarray(whole.resize(size, Image.Resampling.LANCZOS), dtype=np.float32) / 255
     alpha = pixels[:, :, 3:]
     colors = pixels[:, :, :3] * alpha + np.asarray(background, dtype=np.float32) * (1 - alpha)

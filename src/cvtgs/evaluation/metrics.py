@@ -41,7 +41,7 @@ def ssim(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tens
     sigma of 1.5, border "valid" (only windows inside the image), mean over positions and channels.
     This is scikit-image's result with ``gaussian_weights=True, sigma=1.5,
     use_sample_covariance=False``. In float32 it is within 1e-4 of float64, mostly within 1e-5.
-    Memory: about 24 copies of one image, and one of both stacks.
+    Memory: about 26 copies of one image, and one of both stacks.
 
     Args:
         a: ``(c, h, w, 3)`` images, clipped to [0, 1].
@@ -61,7 +61,7 @@ def ssim(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tens
     """
     check_pair(a, b, least=SSIM_WINDOW)
     pairs = zip(a.clamp(0, 1).split(1), b.clamp(0, 1).split(1), strict=True)
-    return torch.cat([mean_ssim(one, other) for one, other in pairs])
+    return torch.cat([mean_ssim(one, other) for one, other in pairs]).clamp(max=1)
 
 
 @torch.no_grad()

@@ -35,7 +35,7 @@ class Score(Record):
     """One metric.
 
     Attributes:
-        mean: Mean over the views.
+        mean: Mean over the views; over those that show something of the full scene, if any does.
         views: The value of each view.
     """
 
@@ -301,18 +301,28 @@ def chosen_metrics(choice: LpipsChoice, size: tuple[int, int]) -> Metrics:
     return Metrics(note=note)
 
 
-def scene_scores(name: str, count: int, rows: Sequence[ImageScores]) -> SceneScores:
-    """Average the scores of a scene, one row per view; all rows must have SSIM."""
+def scene_scores(
+    name: str, count: int, rows: Sequence[ImageScores], *, blind: Sequence[int] = ()
+) -> SceneScores:
+    """Average the scores of a scene, one row per view; all rows must have SSIM.
+
+    Blind views, by their number, do not count in means, unless all are.
+    """
     psnrs, ssims, distances, errors, biases = zip(*rows, strict=True)
     has_alpha = not any(map(math.isnan, errors))
+    counted = [view for view in range(len(rows)) if view not in {*blind}] or range(len(rows))
+
+    def score(values: tuple[float, ...]) -> Score:
+        return Score(mean=Score.of([values[view] for view in counted]).mean, views=values)
+
     return SceneScores(
         name=name,
         count=count,
-        psnr=Score.of(psnrs),
-        ssim=Score.of(ssims),
-        lpips=None if None in distances else Score.of(distances),
-        alpha_error=Score.of(errors) if has_alpha else None,
-        alpha_bias=Score.of(biases) if has_alpha else None,
+        psnr=score(psnrs),
+        ssim=score(ssims),
+        lpips=None if None in distances else score(distances),
+        alpha_error=score(errors) if has_alpha else None,
+        alpha_bias=score(biases) if has_alpha else None,
     )
 
 
@@ -321,7 +331,7 @@ Truth = tuple[Cameras, list[Tensor], Tensor]
 
 
 class Scorer:
-    """Scores scenes against images of a full scene, which are rendered once.
+    """Scores scenes against images of a full scene that count, which are rendered once.
 
     Memory: ``(12 b + 4) c h w`` bytes for ``c`` views over ``b`` backgrounds in float32.
     """
@@ -334,17 +344,21 @@ class Scorer:
         metrics: Metrics,
         images: Iterable[ViewImages] = (),
         backgrounds: Sequence[Color] = (BLACK,),
+        counts: Callable[[ViewImages], bool] = lambda image: True,
         progress: Callable[[int], object] = lambda done: None,
     ) -> None:
         self._metrics = metrics
         self._backgrounds = [full.means.new_tensor(color) for color in backgrounds]
         self._truths: list[Truth] = []
-        for camera in cameras:
-            progress(len(self._truths))
-            self._keep(render_views(full, camera))
+        done = 0
+        for done, camera in enumerate(cameras, start=1):
+            progress(done - 1)
+            truth = render_views(full, camera)
+            if counts(truth):
+                self._keep(truth)
         for image in images:
             self._keep(image)
-        progress(len(self._truths))
+        progress(done)
 
     def __len__(self) -> int:
         return len(self._truths)

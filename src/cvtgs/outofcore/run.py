@@ -18,7 +18,7 @@ from cvtgs.counts import checked_whole, shared_out, shortfall, target_count, who
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
 from cvtgs.edit import concatenate
 from cvtgs.errors import ConfigError, check_path
-from cvtgs.evaluation.compare import check_seen
+from cvtgs.evaluation.blind_views import check_seen
 from cvtgs.grouping import finer_count, most_cells
 from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES, checked_axes

@@ -14,7 +14,7 @@ from cvtgs.config import RefineConfig
 from cvtgs.counts import checked_whole
 from cvtgs.devices import chosen_device, threads_for_chunks, within_memory, without_autocast
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError, memory_errors, warn
-from cvtgs.evaluation.compare import check_seen
+from cvtgs.evaluation.blind_views import check_seen
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.refinement.images import (

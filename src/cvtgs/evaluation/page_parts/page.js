@@ -9,6 +9,12 @@
   const number = (value, digits) => value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });
   const count = (value) => number(value, 0);
   const decibels = (value) => (Number.isFinite(Number(value)) ? number(Number(value), 2) + " dB" : "equal");
+  const meanDecibels = ({ mean, views }) => {
+    const finite = views.map(Number).filter(Number.isFinite);
+    if (Number.isFinite(Number(mean)) || !finite.length) return decibels(mean);
+    const others = finite.reduce((sum, value) => sum + value, 0) / finite.length;
+    return `${decibels(others)}, ${views.length - finite.length} equal`;
+  };
   const bytes = (value) => {
     if (value === null) return "";
     let unit = "B";
@@ -38,7 +44,7 @@
   };
 
   const metrics = [
-    ["PSNR", (scene) => scene.psnr, decibels],
+    ["PSNR", (scene) => scene.psnr, decibels, meanDecibels],
     ["SSIM", (scene) => scene.ssim, (value) => number(Number(value), 3)],
     ["LPIPS", (scene) => scene.lpips, (value) => number(Number(value), 3)],
     ["Alpha error", (scene) => scene.alpha_error, (value) => number(Number(value), 4)],
@@ -84,7 +90,7 @@
       ` from ${views.length === 1 ? "one view" : views.length + " views"}. Drag the divider: full on the left, simplified on the right.`;
     at("scenes").append(...small.map((scene, index) => choice("small", index + 1, [
       make("b", data.named ? scene.name : difference(scene)),
-      make("span", decibels(scene.psnr.mean), { class: "psnr" }),
+      make("span", meanDecibels(scene.psnr), { class: "psnr" }),
       make("small", join(gaussians(scene), bytes(scene.bytes), data.named ? "" : scene.name)),
     ])));
     at("views").append(...views.map((name, index) => choice("view", index + 1, [
@@ -122,7 +128,7 @@
     const sized = data.small.some((one) => one.bytes !== null);
     table("means", ["Scene", "Gaussians", ...(sized ? ["Size"] : []), ...labels], data.small.map((one, row) => ({
       chosen: row === state.small - 1,
-      cells: [one.name, count(one.count), ...(sized ? [bytes(one.bytes)] : []), ...metrics.map(([, of, text]) => text(of(one).mean))],
+      cells: [one.name, count(one.count), ...(sized ? [bytes(one.bytes)] : []), ...metrics.map(([, of, text, mean]) => (mean ? mean(of(one)) : text(of(one).mean)))],
     })));
     at("views-title").textContent = `Per view of ${scene.name}`;
     table("per-view", ["View", ...labels], data.views.map((view, row) => ({

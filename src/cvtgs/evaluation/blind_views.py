@@ -1,0 +1,74 @@
+"""Find views that show nothing of a scene, in which every result would look perfect."""
+
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs.cameras import Cameras
+from cvtgs.errors import InvalidArgumentError, InvalidSceneError, warn
+from cvtgs.evaluation.scorer import render_views
+from cvtgs.math.parameters import MIN_ALPHA
+from cvtgs.rendering import BackendName
+from cvtgs.rendering.projection import to_matrices, warn_of_near_plane
+from cvtgs.scene import GaussianScene
+
+PREVIEW = 96  # longer side of images that only tell whether they show anything, pixels
+SAMPLED = 4096  # about how many Gaussians tell whether a camera sees anything of a scene
+LEAST_COVER = 1e-4  # mean alpha that one image must reach if all centres are outside every image
+
+
+def check_seen(
+    scene: GaussianScene,
+    cameras: Cameras,
+    *,
+    name: str,
+    backend: BackendName = "auto",
+    is_sample: bool = False,
+) -> None:
+    """Raise if no camera sees anything of a scene, or one is no pinhole camera.
+
+    Warn if few see anything, or if the near plane hides much. A sample of a scene cannot tell that
+    a camera sees nothing, so there is no warning of that.
+    """
+    if len(scene) == 0:
+        raise InvalidSceneError(f"{name} must have at least one Gaussian, found none.")
+    to_matrices(cameras)  # alone, each would be "camera 0" in errors
+    warn_of_near_plane(scene, cameras.singles(), name=name)
+    points = _drawn(scene)
+    blind = cameras.to("cpu").singles()
+    for some in (points[:: -(-len(points) // SAMPLED)].cpu(), points):  # all only in doubt
+        exact = some.double()
+        blind = [camera for camera in blind if not camera.shows_any(exact)]
+        if 2 * len(blind) <= len(cameras):
+            return
+    empty = sum(_is_empty(scene, camera.fitted(PREVIEW), backend) for camera in blind)
+    if empty == len(cameras):
+        raise InvalidArgumentError(
+            f"the cameras must see {name}, found nothing of it in any of {len(cameras)} "
+            f"views; give cameras of this scene, in its axes and units."
+        )
+    if 2 * empty > len(cameras) and not is_sample:
+        warn(
+            f"{empty} of {len(cameras)} cameras see nothing of {name}; give cameras of this "
+            f"scene, in its axes and units."
+        )
+
+
+def shows(scene: GaussianScene, camera: Cameras, alpha: Float[Tensor, "1 h w"]) -> bool:
+    """Return whether an image with this accumulated alpha shows something of a scene.
+
+    Either its mean is not negligible, or the centre of a drawn Gaussian is in the image.
+    """
+    if float(alpha.mean()) >= LEAST_COVER:
+        return True
+    return camera.shows_any(_drawn(scene).double())
+
+
+def _drawn(scene: GaussianScene) -> Float[Tensor, "n 3"]:
+    """Return the positions of the Gaussians that renderers draw; all, if they draw none."""
+    is_drawn = scene.opacities >= MIN_ALPHA
+    return scene.means[is_drawn] if bool(is_drawn.any()) else scene.means
+
+
+def _is_empty(scene: GaussianScene, camera: Cameras, backend: BackendName) -> bool:
+    """Return whether an image shows nothing, though Gaussians beside it may reach into it."""
+    return float(render_views(scene, camera, backend=backend).alpha.mean()) < LEAST_COVER

@@ -1,0 +1,88 @@
+"""Views that show nothing of a scene, in which every result looks perfect."""
+
+import math
+import warnings
+
+import pytest
+import torch
+
+from cvtgs import Cameras, GaussianScene, Simplifier, evaluate
+from cvtgs.budget import find_count
+from cvtgs.errors import InvalidSceneError
+from cvtgs.evaluation import EvaluationSettings, compare
+from cvtgs.synthetic import scene as make
+from cvtgs.views import automatic_views
+
+SETTINGS = EvaluationSettings(lpips="off")
+TURNED = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+
+
+@pytest.fixture(scope="module")
+def scene() -> GaussianScene:
+    return make("object", 2000, sh_degree=0, seed=2)
+
+
+@pytest.fixture(scope="module")
+def small(scene: GaussianScene) -> GaussianScene:
+    return Simplifier(preset="fast", device="cpu").simplify(scene, 0.05)
+
+
+def views_of(scene: GaussianScene, blind: int) -> tuple[Cameras, Cameras]:
+    """Return four views, and the same with as many others that look away before them."""
+    good = automatic_views(scene, 4, width=48, height=36, seed=5).to("cpu")
+    away = TURNED.to(good.viewmats) @ good.viewmats[:blind]
+    return good, Cameras(
+        viewmats=torch.cat([away, good.viewmats]),
+        Ks=torch.cat([good.Ks[:blind], good.Ks]),
+        width=48,
+        height=36,
+    )
+
+
+@pytest.mark.parametrize("blind", [0, 1, 3])
+def test_blind_views_do_not_count_in_means(scene, small, blind):
+    good, both = views_of(scene, blind)
+    (alone,) = evaluate(scene, {"small": small}, good, settings=SETTINGS).scenes
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        (found,) = evaluate(scene, {"small": small}, both, settings=SETTINGS).scenes
+    texts = [str(one.message) for one in caught]
+    assert texts == ([f"{blind} of {4 + blind} views show nothing of full, so they do not count in "
+                      f"mean scores."] if blind else [])  # fmt: skip
+    assert found.means() == alone.means()
+    assert found.psnr.views == (*[math.inf] * blind, *alone.psnr.views)
+    assert found.ssim.views == (*[1.0] * blind, *alone.ssim.views)
+
+
+def test_a_view_of_something_tiny_counts():
+    """One Gaussian of a few pixels in a large image."""
+    one = make("object", 1, sh_degree=0)
+    tensors = {
+        "means": torch.tensor([[0.0, 0.0, 5.0]]),
+        "log_scales": torch.full((1, 3), -6.0),
+        "logit_opacities": torch.tensor([4.0]),
+    }
+    tiny = one.with_tensors(tensors)
+    intrinsics = torch.tensor([[[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]])
+    camera = Cameras(viewmats=torch.eye(4)[None], Ks=intrinsics, width=320, height=240)
+    darker = tiny.with_tensors({"sh0": tiny.sh0 - 0.5})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (found,) = evaluate(tiny, {"darker": darker}, camera, settings=SETTINGS).scenes
+    assert math.isfinite(found.psnr.mean)
+
+
+def test_a_search_does_not_measure_blind_views(scene):
+    good, both = views_of(scene, 3)
+    simplifier = Simplifier(preset="fast", device="cpu")
+    with pytest.warns(UserWarning, match="^3 of 7 views show nothing of the scene, so quality is"):
+        found = find_count(scene, psnr=24.0, simplifier=simplifier, heldout=both)
+    alone = find_count(scene, psnr=24.0, simplifier=simplifier, heldout=good)
+    assert (found.psnr, len(found.scene)) == (alone.psnr, len(alone.scene))
+
+
+@pytest.mark.parametrize("score", [evaluate, compare])
+def test_a_scene_without_gaussians_is_refused(scene, score):
+    good, _ = views_of(scene, 0)
+    with pytest.raises(InvalidSceneError, match="full must have at least one Gaussian, found no"):
+        score(scene[:0], {"small": scene}, good)
