@@ -49,12 +49,16 @@ class Figures(NamedTuple):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--output", type=Path, help="page whose tables are updated")
-    parser.add_argument("--case", nargs="+", help="cases to measure; all by default")
+    parser.add_argument(
+        "--case", nargs="+", choices=catalogue(), help="cases to measure; all by default"
+    )
     parser.add_argument("--count", type=int, default=COUNT)
     parser.add_argument(
         "--timed", type=int, default=TIMED, help="Gaussians of the timed scenes; 0 for no times"
     )
     options = parser.parse_args()
+    if options.output is not None and (options.case is not None or not options.timed):
+        parser.error("-o replaces both tables, so it needs all cases and times.")
     cases = {name: make for name, make in catalogue().items() if name in (options.case or [name])}
     text = error_table(cases, options.count)
     if options.timed:

@@ -23,7 +23,7 @@ VARIANTS["paper, with representatives"] = {"preset": "paper", "merge.representat
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--case", nargs="+", default=["points", "needles"])
+    parser.add_argument("--case", nargs="+", choices=catalogue(), default=["points", "needles"])
     parser.add_argument("--count", type=int, default=4000)
     parser.add_argument("--rho", type=float, nargs="+", default=[0.2, 0.02])
     parser.add_argument("--size", type=int, default=400, help="side of the images")

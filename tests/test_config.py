@@ -301,15 +301,6 @@ def test_errors_about_huge_settings_are_short():
     assert all(len(message) < 400 for message in messages)
 
 
-def test_a_file_that_is_missing_or_not_toml_is_an_error(tmp_path):
-    missing, broken, binary = (tmp_path / name for name in ("a.toml", "b.toml", "c.toml"))
-    broken.write_text("cvt = [", encoding="utf-8")
-    binary.write_bytes(b"\xff\xfe\x00")
-    assert compose_error(file=missing) == f"{missing}: cannot be read: No such file or directory."
-    for path in (broken, binary):
-        assert compose_error(file=path).startswith(f"{path}: is not a TOML file: ")
-
-
 def test_a_section_of_a_file_that_is_none_is_named(tmp_path):
     path = tmp_path / "a.toml"
     path.write_text("cvt = 3\n")

@@ -91,6 +91,13 @@ def test_the_tables_of_a_page_are_updated(tmp_path, monkeypatch, capsys):
     page.write_text(f"before\n{MARKS[0]}\nold\n{MARKS[1]}\nafter\n")
     words = ["numerics", "--case", "ball", "three", "--count", "60", "--timed", "0"]
     monkeypatch.setattr("sys.argv", [*words, "-o", str(page)])
+    with pytest.raises(SystemExit):  # which would lose the other rows
+        numerics.main()
+    assert "old" in page.read_text()
+    two = {name: CASES[name] for name in ("ball", "three")}
+    monkeypatch.setattr(numerics, "catalogue", lambda: two)
+    monkeypatch.setattr(numerics, "time_table", lambda *_: "")
+    monkeypatch.setattr("sys.argv", ["numerics", "--count", "60", "-o", str(page)])
     numerics.main()
     text = page.read_text()
     assert text.startswith(f"before\n{MARKS[0]}\n\n| case | condition |")

@@ -107,7 +107,7 @@ def test_the_same_training_gives_the_same_bytes(scenes, cache, tmp_path):
     for kind in ("scene", "local"):
         config, contents = config_of(scenes, kind=kind, steps=4), []
         for name in ("one", "two"):
-            path = tmp_path / f"{name}.safetensors"
+            path = tmp_path / f"{kind}_{name}.safetensors"
             run(config, path, cache)
             contents.append((path.read_bytes(), path.with_suffix(".state").read_bytes()))
         assert contents[0] == contents[1]

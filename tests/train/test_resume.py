@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from cvtgs.errors import CheckpointError
+from cvtgs.errors import CheckpointError, OutputExistsError
 from cvtgs.mergenet import load_checkpoint
 from cvtgs.progress import ProgressEvent
 from cvtgs.train import History, TrainConfig, TrainFiles, loop as train_loop
@@ -159,7 +159,11 @@ def test_without_resume_a_training_starts_over(scenes, cache, tmp_path):
     path = tmp_path / "net.safetensors"
     with pytest.raises(PowerCutError):
         run(config_of(scenes), path, cache, listener=interrupting(5))
-    history = run(config_of(scenes), path, cache)
+    before = path.read_bytes()
+    with pytest.raises(OutputExistsError, match=r"net\.safetensors: the output must not exist yet"):
+        run(config_of(scenes), path, cache)
+    assert path.read_bytes() == before
+    history = run(config_of(scenes), path, cache, overwrite=True)
     assert [entry.step for entry in history.validations] == [0, 2, 4, 6, 7]
 
 

@@ -119,9 +119,9 @@ def find_count(
 
     Quality is measured over the eight automatic views of ``cvtgs evaluate``; for presets that use
     images, over eight others, which no preset uses. Views that show nothing of the scene are left
-    out. The full scene is rendered, checked and
-    analyzed once; a search takes six to ten simplifications. If quality does not rise
-    monotonically with the count, a smaller count may also reach it.
+    out. The full scene is rendered, checked and analyzed once; a search takes six to ten
+    simplifications. If quality does not rise monotonically with the count, a smaller count may
+    also reach it.
 
     Memory: that of a simplification, one small scene, and ``12 c h w`` bytes of images.
 

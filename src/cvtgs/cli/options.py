@@ -115,7 +115,7 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
         "help": "MergeNet checkpoint: auto (default: that of the preset), standard, paper, a "
         "file, or none to merge by moments alone",
     },
-    "--config": {"metavar": "F.toml", "type": any_path, "help": "configuration file"},
+    "--config": {"metavar": "FILE", "type": any_path, "help": "settings, or an earlier report"},
     "--set": {
         "metavar": "KEY=VALUE",
         "action": "append",

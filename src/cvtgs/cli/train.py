@@ -74,17 +74,15 @@ def train(options: argparse.Namespace) -> None:
     config = cvtgs.train.TrainConfig.from_toml(options.config)
     config = _with_scenes(config, options.scenes, options.validation)
     files = cvtgs.train.TrainFiles.beside(options.output, options.cache)
-    resumes = options.resume and files.state.is_file()
-    if options.resume and not resumes:
+    if options.resume and not files.state.is_file():
         warn(f"{files.state}: there is no such state, so the training starts from the beginning.")
-    for path in (files.checkpoint, files.state, files.curves):
-        cvtgs.io.check_output(path, overwrite=options.overwrite or resumes)
     device = chosen_device(options.device)
     with progress_bars(quiet=options.quiet) as listener:
         history = cvtgs.train.train(
             config,
             files,
             resume=options.resume,
+            overwrite=options.overwrite,
             device=device,
             listener=listener,
             on_validation=lambda history: None if options.quiet else print_validation(history),

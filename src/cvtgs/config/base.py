@@ -1,8 +1,9 @@
 """Shared by configurations and reports: strict models, TOML reading, error texts."""
 
+import json
 import os
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -69,17 +70,40 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
         ConfigError: The file cannot be read, or is not TOML.
         InvalidArgumentError: ``path`` is no path.
     """
+    found: dict[str, Any] = _parsed(path, tomllib.loads, "a TOML")
+    return found
+
+
+def read_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a TOML file, or from a ``.json`` file the configuration of a report.
+
+    Raises:
+        ConfigError: The file cannot be read, or holds neither.
+        InvalidArgumentError: ``path`` is no path.
+    """
+    check_path(path)
+    if Path(path).suffix.lower() != ".json":
+        return read_toml(path)
+    report = _parsed(path, json.loads, "a JSON")
+    config = report.get("config") if isinstance(report, dict) else None
+    if not isinstance(config, dict):
+        raise ConfigError(f"{path}: must be a report with a config, or a TOML file.")
+    return config
+
+
+def _parsed(path: str | os.PathLike[str], parse: Callable[[str], Any], kind: str) -> Any:
+    """Parse a text file; raise if it is not of its kind."""
     check_path(path)
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+        return parse(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}.") from None
     except RecursionError:
         raise ConfigError(
-            f"{path}: is not a TOML file: its values are nested too deeply."
+            f"{path}: is not {kind} file: its values are nested too deeply."
         ) from None
-    except ValueError as error:  # not TOML, not UTF-8, or a number of thousands of digits
-        raise ConfigError(f"{path}: is not a TOML file: {shortened(str(error), 200)}.") from None
+    except ValueError as error:  # another kind, not UTF-8, or a number of thousands of digits
+        raise ConfigError(f"{path}: is not {kind} file: {shortened(str(error), 200)}.") from None
 
 
 def explain(

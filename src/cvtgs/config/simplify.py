@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import pydantic
 
-from cvtgs.config.base import Section, named, read_toml
+from cvtgs.config.base import Section, named, read_settings
 from cvtgs.config.sections import (
     AllocationConfig,
     EffectsConfig,
@@ -247,7 +247,8 @@ class SimplifyConfig(Section):
         """Compose a configuration from a file, a preset and single settings.
 
         Args:
-            file: A TOML file; missing keys come from the preset.
+            file: A TOML file, whose missing keys come from the preset, or a report of ``cvtgs
+                simplify``, whose configuration is taken (``.json``).
             preset: Name of the preset; overrides the one in the file.
             settings: Texts by dotted key, for example ``{"cvt.iterations": "10"}``; they override
                 all others.
@@ -258,7 +259,7 @@ class SimplifyConfig(Section):
         Raises:
             ConfigError: The file cannot be read, a key is unknown, or a value is out of range.
         """
-        values = {} if file is None else read_toml(file)
+        values = {} if file is None else read_settings(file)
         if not isinstance(settings, Mapping | None) or not all(
             isinstance(key, str) for key in settings or {}
         ):
@@ -279,7 +280,7 @@ class SimplifyConfig(Section):
         except ConfigError:
             if file is not None:
                 try:
-                    cls.from_mapping(read_toml(file))
+                    cls.from_mapping(read_settings(file))
                 except ConfigError as error:  # the file alone is no configuration
                     raise ConfigError(f"{file}: {error}") from None
             raise

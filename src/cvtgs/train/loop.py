@@ -26,7 +26,7 @@ from cvtgs.errors import (
     warn,
 )
 from cvtgs.evaluation.scorer import ViewImages
-from cvtgs.io.atomic import make_folder, write_atomically
+from cvtgs.io.atomic import check_output, make_folder, write_atomically
 from cvtgs.mergenet import (
     Architecture,
     CheckpointInfo,
@@ -63,6 +63,7 @@ def train(
     files: TrainFiles,
     *,
     resume: bool = False,
+    overwrite: bool = False,
     device: torch.device | str = "auto",
     listener: ProgressListener = silent,
     on_validation: Callable[[History], None] = lambda history: None,
@@ -76,10 +77,11 @@ def train(
 
     Args:
         config: The settings.
-        files: Output files; checkpoint, state and curves are replaced during training.
+        files: Output files; the training replaces its own checkpoint, state and curves.
         resume: Whether to resume from ``files.state`` if it exists. All settings but ``note`` and
             ``patience``, the scenes and the start must be the same; their paths may differ. A
             finished training goes on with ``restart_step`` at its end.
+        overwrite: Whether files of another training may be replaced.
         device: Device to train on; ``auto`` takes CUDA if there is any.
         listener: Called for each prepared scene and each step.
         on_validation: Called after each validation.
@@ -93,6 +95,7 @@ def train(
             checkpoint to continue is missing and the state does not hold its network.
         InvalidSceneError: A scene cannot be used; the message names it.
         TrainingError: The loss is not finite; the message names the scene and the last good file.
+        OutputExistsError: A file exists and may not be replaced.
         OutputError: A file cannot be written.
 
     Example:
@@ -116,11 +119,14 @@ def train(
         [0, 2]
     """
     check_listener(listener)
+    resumes = resume and files.state.is_file()
+    for path in (files.checkpoint, files.state, files.curves):
+        check_output(path, overwrite=overwrite or resumes)
     sources = find_sources(config.data, seed=config.seed)
     device = chosen_device(device)
     origins = {source.origin: None for source in sources}
     state = TrainState(_first_net(config).to(device), config, origins)
-    if resume and files.state.is_file():
+    if resumes:
         state.load(files.state, config)
         _restore_checkpoint(state, config, files)
     make_folder(files.cache)
