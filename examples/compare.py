@@ -22,14 +22,14 @@ def main() -> None:
     scene = cvtgs.load(options.input)
     small = {
         preset: cvtgs.Simplifier(config=preset).simplify(scene, options.rho)
-        for preset in options.presets.split(",")
+        for preset in map(str.strip, options.presets.split(","))
     }
     views = cvtgs.views.automatic_views(scene, 4, width=options.size, height=options.size)
     # lpips="auto" also measures LPIPS if its weights are found.
     comparison = compare(scene, small, views, settings=EvaluationSettings(lpips="off"))
     for scores in comparison.evaluation.scenes:
         print(f"{scores.name:<10} {scores.psnr.mean:6.2f} dB, SSIM {scores.ssim.mean:.3f}")
-    write_comparison(comparison, options.output, overwrite=True)
+    write_comparison(comparison, options.output)
 
 
 if __name__ == "__main__":

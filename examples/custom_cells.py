@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("--column", default="label", help="an extra column of the file")
     parser.add_argument("--rho", type=float, default=0.05)
     options = parser.parse_args()
-    scene = cvtgs.load(options.input)
+    scene = cvtgs.validity.check_rows(cvtgs.load(options.input)).scene
     if not scene.extras:
         parser.error(f"{options.input} must have an extra column of labels, found none")
     if options.column not in scene.extras:

@@ -1,6 +1,7 @@
 """Many scenes in one command, standard streams, sizes and the last line of the output."""
 
 import io
+import json
 import re
 import subprocess
 import sys
@@ -193,10 +194,19 @@ def test_a_folder_with_an_impossible_name_is_one_sentence(
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_a_report_needs_exactly_one_scene(scenes: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["simplify", *NAMES, "-o", "out", "--rho", "0.1", "--report", "r.json", *SMALL]
-    assert main(words) == 1
-    assert capsys.readouterr().err == "cvtgs: error: --report needs exactly one scene, found 3.\n"
+def test_the_report_of_many_scenes_has_one_entry_for_each(scenes: Path) -> None:
+    (scenes / "bad.ply").write_bytes(b"none")
+    words = ["simplify", NAMES[0], "bad.ply", "missing.ply", "-o", "out", "--rho", "0.1", *SMALL]
+    assert main([*words, "--report", "r.json"]) == 1
+    good, bad, missing = json.loads((scenes / "r.json").read_text())
+    assert (good["input"], good["output"]) == (NAMES[0], str(Path("out") / NAMES[0]))
+    assert good["error"] is None
+    assert len(cvtgs.load(good["output"])) == good["report"]["output_count"] > 0
+    for entry, reason in ((bad, "bad.ply"), (missing, "missing.ply")):
+        assert entry["report"] is None
+        assert reason in entry["error"]
+    assert main([*words[:2], *words[4:], "--overwrite", "--report", "r.json"]) == 0
+    assert [entry["error"] for entry in json.loads((scenes / "r.json").read_text())] == [None]
 
 
 @pytest.mark.parametrize(

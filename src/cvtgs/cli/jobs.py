@@ -176,13 +176,20 @@ def check_suffix(suffix: str | None) -> None:
         )
 
 
-def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> None:
-    """Call ``work`` for every scene, and print the results and their paths."""
+def run_jobs(
+    jobs: Sequence[SceneJob],
+    work: Callable[[SceneJob], Outcome],
+    failed: Callable[[SceneJob, CvtgsError], None] = lambda job, error: None,
+) -> None:
+    """Call ``work`` for every scene, and print the results and their paths.
+
+    Of many scenes, one that fails is passed to ``failed``, and the others follow.
+    """
     first = jobs[0]
     if not first.is_one_of_many:
         _run_one(first, work)
         return
-    folder, quiet, failed = first.options.folder, first.options.quiet, 0
+    folder, quiet, failures = first.options.folder, first.options.quiet, 0
     before = after = 0
     for number, job in enumerate(jobs, start=1):
         source, target = job.options.input, job.options.output
@@ -191,7 +198,8 @@ def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> N
             bytes_in = cvtgs.io.scene_size(source)
             outcome = work(job)
         except CvtgsError as error:
-            failed += 1
+            failures += 1
+            failed(job, error)
             say(printable_name(f"cvtgs: error: {place}{error}"), file=sys.stderr)
             continue
         bytes_out = cvtgs.io.scene_size(target)
@@ -202,11 +210,11 @@ def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> N
             say(f"{place}{shortened(printable_name(target.name), room)}: {facts}", flush=True)
             for note in outcome.notes:
                 say_wrapped(note, indent=len(place))
-    done = len(jobs) - failed
-    if failed:
+    done = len(jobs) - failures
+    if failures:
         are = "is" if done == 1 else "are"
         raise RunError(
-            f"{failed} of {counted(len(jobs), 'scene')} failed; {done} {are} in {folder}."
+            f"{failures} of {counted(len(jobs), 'scene')} failed; {done} {are} in {folder}."
         )
     if not quiet:
         scenes = counted(done, "scene")

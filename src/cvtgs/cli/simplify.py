@@ -35,16 +35,14 @@ from cvtgs.cli.options import (
     seconds,
 )
 from cvtgs.cli.paths import any_path, new_file
+from cvtgs.cli.reports import report_file
 from cvtgs.errors import (
     ConfigError,
     FileFormatError,
     InputError,
     InvalidArgumentError,
-    OutputError,
-    OutputExistsError,
     warn,
 )
-from cvtgs.io.atomic import write_atomically
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.text import counted
 
@@ -148,7 +146,8 @@ def add_simplify(add_parser: AddParser) -> None:
         "--report",
         type=partial(new_file, kind=".json"),
         metavar="R.json",
-        help="file for a JSON report of the run",
+        help="file for a JSON report of the run; with -o DIR, a list of the input, output, error "
+        "and report of each scene",
     )
     add_options(parser, "--sh-degree", "--axes", "--lod", "--device", "--trust-sizes")
     add_options(parser, "--overwrite", "--quiet")
@@ -165,22 +164,26 @@ def simplify(options: argparse.Namespace) -> None:
         file=options.config, preset=preset_of(options), settings=settings
     )
     with open_jobs(options) as jobs:
-        if options.report is not None and len(jobs) > 1:
-            raise InvalidArgumentError(f"--report needs exactly one scene, found {len(jobs)}.")
         for job in jobs:
             check_written_files(job.options)
             cvtgs.io.check_save(job.options.output, overwrite=options.overwrite)
-        if options.report is not None:
-            cvtgs.io.check_output(options.report, overwrite=options.overwrite)
         for job in jobs[1:]:
             job.options.recalibrate = False  # once is enough
-        run_jobs(jobs, lambda job: _simplify_one(job, checkpoint, config, settings))
+
+        with report_file(options, jobs) as file:
+
+            def work(job: SceneJob) -> Outcome:
+                outcome, report = _simplify_one(job, checkpoint, config, settings)
+                file.add(job, report)
+                return outcome
+
+            run_jobs(jobs, work, failed=file.add_error)
 
 
 def _simplify_one(
     job: SceneJob, checkpoint: str | None, config: "SimplifyConfig", settings: Mapping[str, str]
-) -> Outcome:
-    """Simplify one scene, in memory or block by block, and return the result to print."""
+) -> "tuple[Outcome, SimplifyReport]":
+    """Simplify one scene, in memory or block by block; return the result to print and report."""
     options, notes = job.options, list[str]()
     options.begun = time.perf_counter() if job.is_one_of_many else STARTED
     with progress_bars(quiet=options.quiet, transient=job.is_one_of_many) as listener:
@@ -199,8 +202,6 @@ def _simplify_one(
             notes.append(
                 f"--set {' '.join(unused)} had no effect: {used.preset} uses no such images."
             )
-    if options.report is not None:
-        _write_report(options, report)
     searched = has_target(options)
     if not job.is_one_of_many and report.stages:
         seconds = (f"{stage.stage}{TIE}{stage.seconds:.2f}" for stage in report.stages)
@@ -216,11 +217,12 @@ def _simplify_one(
     elif options.keep is not None:
         warn(f"{options.keep}: no Gaussian is in the boxes of --keep, so none is protected.")
     total = time.perf_counter() - options.begun if searched else report.seconds
-    return Outcome(
+    outcome = Outcome(
         f"{report.input_count:,} -> {counted(report.output_count, 'Gaussian')}",
         f"{total:.2f} s",
         notes + report_notes(report),
     )
+    return outcome, report
 
 
 def _unused(settings: Mapping[str, str], config: "SimplifyConfig") -> list[str]:
@@ -291,18 +293,6 @@ def _simplify_in_memory(
     cvtgs.io.save(small, options.output, overwrite=options.overwrite, axes=axes.target)
     remove_job_files(options.output)
     return report, notes
-
-
-def _write_report(options: argparse.Namespace, report: "SimplifyReport") -> None:
-    try:
-        write_atomically(options.report, report.to_json().encode(), overwrite=options.overwrite)
-    except OSError as error:
-        if not isinstance(error, OutputError | OutputExistsError):
-            raise
-        reason = str(error).removesuffix("; nothing was written.").rstrip(".")
-        raise OutputError(
-            f"{reason}; the scene {options.output} was written, the report was not."
-        ) from error
 
 
 def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
