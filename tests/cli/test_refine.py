@@ -67,7 +67,7 @@ def test_refinement_is_off_by_default(source, tmp_path):
     [
         (
             ["--refine-steps", "-2"],
-            "refine.steps: input should be greater than or equal to 0, found '-2'.",
+            "--refine-steps must be at least 0, found -2.",
         ),
         *(
             (

@@ -46,7 +46,10 @@ def memory_of(options: argparse.Namespace) -> int:
         raise InvalidArgumentError(f"--workers must be at least 1, found {options.workers}.")
     if options.memory is None:
         return memory_to_plan()
-    return read_bytes(options.memory)
+    try:
+        return read_bytes(options.memory)
+    except InvalidArgumentError as error:
+        raise InvalidArgumentError(f"--{error}") from None
 
 
 def check_block_device(options: argparse.Namespace) -> None:

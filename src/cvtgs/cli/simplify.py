@@ -300,6 +300,8 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
     limits = (options.refine, options.refine_steps)
     if limits == (None, None):
         return {}
+    if options.refine_steps is not None and options.refine_steps < 0:
+        raise InvalidArgumentError(f"--refine-steps must be at least 0, found {limits[1]}.")
     if None not in limits and 0 in limits and limits != (0, 0):
         raise InvalidArgumentError(
             "--refine and --refine-steps must both be above 0, or one of them be left out: 0 turns "

@@ -108,7 +108,7 @@ def load(
             ``"rdf"`` for other files.
         trust_sizes: Whether a compressed file may unpack to any size. By default, one that claims
             far more Gaussians than its bytes can hold is refused before it takes memory.
-        lod: Level of a streamed SOG; None for 0, the finest. Other files have no levels.
+        lod: Level of a streamed SOG; None for 0, the finest. Other files have no other level.
 
     Returns:
         The scene: float32, or float64 if the file has double coordinates.
@@ -164,12 +164,12 @@ def load(
         options = {"sh_degree": sh_degree, "extras": extras}
     elif suffix in _STATES_AXES:
         options["axes"] = axes
-    if lod is not None:
-        if suffix != _STREAM:
-            raise InvalidArgumentError(
-                f"lod must be given only for a streamed SOG ({_STREAM}), found {lod} for {source}."
-            )
+    if lod is not None and suffix == _STREAM:
         options["lod"] = lod
+    elif lod not in (None, 0):
+        raise InvalidArgumentError(
+            f"lod must be 0 unless for a streamed SOG ({_STREAM}), found {lod!r} for {source}."
+        )
     with memory_errors(f"{source}: reading the scene", BLOCKS_ADVICE):
         read: Callable[..., GaussianScene] = resolve_name(_READERS[suffix])
         scene = read(source, **options)
