@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -241,3 +242,17 @@ def test_reclaimable_pages_give_no_room_above_the_limit(tmp_path):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text, encoding="utf-8")
     assert control_group_rooms(tmp_path) == [1000]
+
+
+@pytest.mark.parametrize("room", [15_999, 16_000])
+def test_too_small_a_disk_is_said_before_the_work(tmp_path, monkeypatch, room):
+    """200 rows of 68 bytes, and 12 bytes more for each."""
+    cvtgs.save(cvtgs.synthetic.scene("object", 200, sh_degree=0), tmp_path / "a.ply")
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=room))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        simplify_file(tmp_path / "a.ply", tmp_path / "b.ply", 0.1, blocks=2)
+    texts = [str(one.message) for one in caught]
+    assert len(texts) == (room < 16_000)
+    for text in texts:
+        assert "blocks take some 16.0 kB, but 16.0 kB of the disk are free; write the" in text

@@ -10,11 +10,14 @@ from pathlib import Path
 
 from cvtgs.clock import StageClock
 from cvtgs.config.base import Record
-from cvtgs.errors import InputError, OutputError
+from cvtgs.errors import InputError, OutputError, warn
 from cvtgs.io.locks import hidden_path, lock_path, output_lock
 from cvtgs.mergenet import Checkpoint, encode_checkpoint
 from cvtgs.outofcore.job import Job
 from cvtgs.processes import Workers
+from cvtgs.text import size_text
+
+EXTRA_BYTES = 12  # of the files of blocks for each Gaussian, beyond those of the source
 
 
 class JobSizes(Record):
@@ -40,6 +43,7 @@ def started(
             job.start_over()
             sizes = {name: getattr(job, name) for name in JobSizes.model_fields}
             job.write_file("sizes.json", json.dumps(sizes).encode())
+            _warn_of_full_disk(job)
         check: Callable[[Job], object] | None = getattr(workers, "check", None)
         if check is not None:  # workers on other machines
             with clock.stage("workers"):
@@ -57,6 +61,19 @@ def started(
         if not resumes:
             shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
         raise
+
+
+def _warn_of_full_disk(job: Job) -> None:
+    """Warn if the files of the blocks will probably not fit on their disk."""
+    needed = job.source.count * (job.source.dtype.itemsize + EXTRA_BYTES)
+    with suppress(OSError):
+        free = shutil.disk_usage(job.folder).free
+        if free < needed:
+            warn(
+                f"{Path(job.folder).parent}: the files of the blocks take some "
+                f"{size_text(needed)}, but {size_text(free)} of the disk are free; write the "
+                f"output to a larger one."
+            )
 
 
 def _stamp(path: str) -> tuple[int, int] | None:
