@@ -11,12 +11,10 @@ import torch
 from torch import Tensor
 
 from cvtgs import GaussianScene, Simplifier, load, save
-from cvtgs.errors import DroppedDataWarning
 from cvtgs.streams import geo_transform, plan_stream, stream_file, write_tiles
 from cvtgs.synthetic import scene as make
 
 SURVEY = torch.tensor([2_683_000.125, -410.5, 1_247_000.75], dtype=torch.float64)
-ONLY_DOUBLES = r"do not hold double precision\.$"  # and no digits of positions
 FAST = Simplifier(None, preset="draft", device="cpu")
 
 
@@ -60,22 +58,22 @@ def assert_finest_is(scene: GaussianScene, folder: Path, *, digits: float) -> No
     assert float(apart.amin(dim=1).max()) < digits
 
 
+@pytest.mark.filterwarnings("error")
 def test_far_from_the_origin_positions_keep_their_digits(tmp_path: Path) -> None:
     scene = surveyed()
     levels = FAST.levels(scene, [1.0, 0.05])
-    with pytest.warns(DroppedDataWarning, match=ONLY_DOUBLES):
-        write_tiles(plan_stream(levels, chunk_gaussians=300), tmp_path, tile_gaussians=500)
+    write_tiles(plan_stream(levels, chunk_gaussians=300), tmp_path, tile_gaussians=500)
     assert len(list(placed(tmp_path))) > 4
     assert_finest_is(scene, tmp_path, digits=3e-4)
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.slow
 def test_blocks_keep_them_too(tmp_path: Path) -> None:
     scene = surveyed()
     save(scene, tmp_path / "survey.ply")
     options: dict[str, Any] = {"kind": "3dtiles", "blocks": 3, "simplifier": FAST}
-    with pytest.warns(DroppedDataWarning, match=ONLY_DOUBLES):
-        stream_file(tmp_path / "survey.ply", tmp_path / "out", [1.0, 0.05], **options)
+    stream_file(tmp_path / "survey.ply", tmp_path / "out", [1.0, 0.05], **options)
     root = json.loads((tmp_path / "out" / "tileset.json").read_text())["root"]
     assert "content" not in root
     assert_finest_is(scene, tmp_path / "out", digits=3e-4)
@@ -125,3 +123,17 @@ def test_the_transform_of_a_place_on_earth() -> None:
     for wrong in ((0.0, 91.0), (400.0, 0.0), (0.0, math.nan)):
         with pytest.raises(ValueError, match="a latitude from -90 to 90"):
             geo_transform(*wrong)
+
+
+def test_the_error_of_the_whole_tileset_is_in_the_units_of_its_place(tmp_path: Path) -> None:
+    """Transforms scale the errors of tiles, but that of the tileset is outside of all tiles."""
+    levels = FAST.levels(make("object", 2000, sh_degree=0, seed=2), [1.0, 0.05])
+    plan = plan_stream(levels, chunk_gaussians=300)
+    wide = (0.0, 2.5, 0.0, 0.0, -100.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 2.0, 3.0, 1.0)
+    for name, transform in (("plain", None), ("wide", wide)):
+        write_tiles(plan, tmp_path / name, transform=transform)
+    plain, scaled = (
+        json.loads((tmp_path / name / "tileset.json").read_text()) for name in ("plain", "wide")
+    )
+    assert scaled["geometricError"] == pytest.approx(100 * plain["geometricError"])
+    assert scaled["root"]["geometricError"] == plain["root"]["geometricError"]

@@ -88,10 +88,9 @@ class TilesFormat:
             some = tagged_if_flat(scene.select(rows.to(scene.device)))
             means = some.means.detach().double()
             origins[id(tile)] = _median(means)
-            local = means - means.new_tensor(origins[id(tile)])
-            turned = change_axes(
-                some.with_tensors({"means": local.to(some.dtype)}), SCENE_AXES, AXES
-            )
+            tensors = {**some.tensors(), "means": means - means.new_tensor(origins[id(tile)])}
+            local = some.with_tensors({name: one.float() for name, one in tensors.items()})
+            turned = change_axes(local, SCENE_AXES, AXES)
             path = folder / names[id(tile)]
             with atomic_output(path, overwrite=True) as file:
                 write_spz_glb(turned, file)
@@ -114,14 +113,15 @@ class TilesFormat:
         """Return the content of ``tileset.json``; tiles share no other file."""
         low, high = join_boxes((part.box_min, part.box_max) for part in parts)
         root = join_trees(parts, lambda part: parts[part].tree, _parent)
-        placed = _relative(root, _matrix(_UNMOVED if self.transform is None else self.transform))
+        to_place = _matrix(_UNMOVED if self.transform is None else self.transform)
+        scale = float(to_place[:3, :3].norm(dim=0).max())  # of the root's own error, for viewers
         extensions = {"extensionsUsed": [SPLATS, SPZ], "extensionsRequired": [SPLATS, SPZ]}
         return {
             "asset": {"version": "1.1", "generator": "cvtgs"},
             "extensionsUsed": ["3DTILES_content_gltf"],
             "extensions": {"3DTILES_content_gltf": extensions},
-            "geometricError": max(root["geometricError"], math.dist(low, high)),
-            "root": {"refine": "REPLACE", **placed},
+            "geometricError": scale * max(root["geometricError"], math.dist(low, high)),
+            "root": {"refine": "REPLACE", **_relative(root, to_place)},
         }
 
 
