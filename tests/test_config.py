@@ -290,7 +290,7 @@ def test_errors_about_huge_files_are_short(tmp_path, text, end):
     path.write_text(text, encoding="utf-8")
     message = compose_error(file=path)
     assert message.startswith(f"{path}: ")
-    assert message.endswith(end)
+    assert message.endswith((end, "its values are nested too deeply."))  # dots in Python 3.14
     assert "\n" not in message
     assert len(message) < len(str(path)) + 400
 

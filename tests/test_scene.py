@@ -173,7 +173,7 @@ def test_select_copies():
 
 
 def test_with_tensors_keeps_comments_and_layout():
-    scene = GaussianScene(**tensors_of(), comments=("a",), layout=(("x", "float"),))
+    scene = GaussianScene(**tensors_of(), comments=["a"], layout=[["x", "float"]])
     changed = scene.with_tensors({"means": torch.ones(4, 3)}, {"b": torch.zeros(4)})
     assert changed.comments == ("a",)
     assert changed.layout == (("x", "float"),)
@@ -324,6 +324,8 @@ def test_scenes_can_be_copied_and_sent_to_other_processes(copied):
     assert all(torch.equal(other.tensors()[name], value) for name, value in scene.tensors().items())
     assert torch.equal(other.extras["label"], scene.extras["label"])
     assert (other.comments, other.layout) == (scene.comments, scene.layout)
+    own, theirs = ({x.data_ptr() for x in made.tensors().values()} for made in (scene, other))
+    assert not own & theirs
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -364,8 +366,8 @@ def test_joining_tagged_and_other_scenes_warns():
 
 
 def test_layouts_hold_pairs_and_tensors_have_names():
-    for layout in (5, ("abc",), (1, 2)):
-        with pytest.raises(InvalidSceneError, match="layout must be a tuple of pairs, found"):
+    for layout in (5, ("abc",), (1, 2), (("x",),), ((1, 2),)):
+        with pytest.raises(InvalidSceneError, match="layout must be a tuple of pairs of texts, fo"):
             replace(random_scene(3), layout=layout)
     with pytest.raises(InvalidSceneError, match="tensors must be a mapping by name, found"):
         random_scene(3).with_tensors(torch.zeros(3))

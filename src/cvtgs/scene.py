@@ -3,7 +3,6 @@
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
 from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import Any, BinaryIO, Literal, Self
@@ -28,6 +27,19 @@ NORMALS = ("nx", "ny", "nz")
 _CHUNK = 1 << 16
 _NOT_INDEXABLE = (torch.uint16, torch.uint32, torch.uint64)  # torch cannot select their rows
 _TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _is_pair_of_texts(value: object) -> bool:
+    return isinstance(value, tuple | list) and len(value) == 2 and all(map(_is_text, value))
+
+
+def _rebuilt(kind: type["GaussianScene"], values: dict[str, Any]) -> "GaussianScene":
+    """Return a scene of its fields, from a pickle or for a deep copy."""
+    return kind(**values)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
@@ -106,13 +118,12 @@ class GaussianScene:
                 f"shN must hold 0, 3, 8 or 15 coefficients per channel, found {bands}."
             )
         names = tuple(self.extras) if isinstance(self.extras, Mapping) else self.extras
-        of_texts, of_pairs = ("texts", str), ("pairs", tuple | list)
-        for what, lines, (entries, kind) in (
-            ("comments", self.comments, of_texts),
-            ("names of extra columns", names, of_texts),
-            ("layout", self.layout, of_pairs),
+        for what, lines, entries, fits in (
+            ("comments", self.comments, "texts", _is_text),
+            ("names of extra columns", names, "texts", _is_text),
+            ("layout", self.layout, "pairs of texts", _is_pair_of_texts),
         ):
-            if not isinstance(lines, tuple | list) or not all(isinstance(x, kind) for x in lines):
+            if not isinstance(lines, tuple | list) or not all(map(fits, lines)):
                 wanted = f"{what} must be a tuple of {entries}"
                 raise InvalidSceneError(f"{wanted}, found {shown(lines)}.")
         for name, column in self.extras.items():
@@ -126,6 +137,8 @@ class GaussianScene:
                     f"found {tuple(column.shape)} on {column.device}."
                 )
         object.__setattr__(self, "extras", MappingProxyType(dict(self.extras)))
+        object.__setattr__(self, "comments", tuple(self.comments))
+        object.__setattr__(self, "layout", tuple(map(tuple, self.layout)))
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -323,7 +336,7 @@ class GaussianScene:
         """Support pickling and deep copies, which mapping proxies do not."""
         values = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
         values["extras"] = dict(self.extras)
-        return partial(type(self), **values), ()
+        return _rebuilt, (type(self), values)
 
     def __repr__(self) -> str:
         """Return count, degree, dtype and device, not the values."""

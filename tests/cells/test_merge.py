@@ -281,3 +281,12 @@ def test_wrong_arguments(scene, partition, config, text):
     with pytest.raises(InvalidArgumentError) as caught:
         merge_cells(scene, partition, config=config)
     assert str(caught.value) == text
+
+
+def test_a_scene_with_gradients_can_be_merged():
+    scene = random_scene(6)
+    graph = {name: value.clone().requires_grad_() for name, value in scene.tensors().items()}
+    cells = Partition.from_labels(torch.tensor([0, 0, 0, 1, 1, 2]), 3)
+    found = merge_cells(scene.with_tensors(graph), cells, config=MergeConfig())
+    assert same_bits(found, merge_cells(scene, cells, config=MergeConfig()))
+    assert not found.means.requires_grad

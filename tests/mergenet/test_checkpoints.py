@@ -85,6 +85,18 @@ def test_a_loaded_network_is_ready_for_inference(path):
     assert {values.device.type for values in net.parameters()} == {"cpu"}
 
 
+@pytest.mark.parametrize("name", SHIPPED)
+def test_loading_changes_no_state_of_the_process_even_for_a_moment(path, name, monkeypatch):
+    """Other threads would see other random numbers, or another default dtype."""
+    shipped = load_checkpoint(name)
+    path.write_bytes(encode_checkpoint(shipped.net, shipped.info))
+    for function in ("torch.set_default_dtype", "torch.set_rng_state", "torch.manual_seed"):
+        monkeypatch.setattr(function, pytest.fail)
+    before = torch.get_rng_state()
+    load_checkpoint(path)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_the_same_network_gives_the_same_bytes(path):
     net = lively_net(torch.float32, architecture=SMALL)
     contents = {encode_checkpoint(net, INFO) for _ in range(20)}

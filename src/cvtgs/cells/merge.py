@@ -38,6 +38,7 @@ FULL_DEPTH = math.pi**2 / 6
 """The optical depth of an opaque Gaussian summed over an image, as a multiple of its area."""
 
 
+@torch.no_grad()
 @checked
 def merge_cells(
     scene: GaussianScene,

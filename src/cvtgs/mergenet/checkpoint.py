@@ -13,7 +13,6 @@ from torch import Tensor
 
 from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.config.base import Record
-from cvtgs.devices import in_float32
 from cvtgs.errors import (
     CheckpointError,
     ConfigError,
@@ -251,16 +250,15 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
 
 
 def build_network(architecture: Architecture | PublishedArchitecture) -> Net:
-    """Build an untrained network in float32 on the CPU, which changes nothing."""
-    with in_float32(), torch.device("cpu"):  # the program may have other defaults
-        if isinstance(architecture, PublishedArchitecture):
-            return PublishedMergeNet(architecture).float()
-        return MergeNet(architecture).float()
+    """Build an untrained network in the default dtype on the default device."""
+    if isinstance(architecture, PublishedArchitecture):
+        return PublishedMergeNet(architecture)
+    return MergeNet(architecture)
 
 
 def _build_net(info: CheckpointInfo, tensors: dict[str, Tensor], name: str) -> Net:
-    with torch.random.fork_rng(devices=[]):  # layers start with random weights
-        net = build_network(info.architecture)
+    with torch.device("meta"):  # neither draws random weights nor needs another default dtype
+        net = build_network(info.architecture).float()
     if isinstance(net, MergeNet) and not any(key.startswith(KNOWN) for key in tensors):
         own = net.state_dict()
         tensors = tensors | {key: own[key] for key in own if key.startswith(KNOWN)}
@@ -274,7 +272,7 @@ def _build_net(info: CheckpointInfo, tensors: dict[str, Tensor], name: str) -> N
         )
     if not all(bool(torch.isfinite(values).all()) for values in tensors.values()):
         raise CheckpointError(f"{name}: the checkpoint holds weights that are not finite.")
-    net.load_state_dict(tensors)
+    net.load_state_dict({key: values.clone() for key, values in tensors.items()}, assign=True)
     return net.eval().requires_grad_(False)
 
 
