@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from cvtgs.checks import checked
 from cvtgs.devices import chunk_length
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError, warn
 from cvtgs.math import parameters
@@ -46,6 +47,7 @@ class CheckedScene(NamedTuple):
     is_valid: Bool[Tensor, "n"] | None = None
 
 
+@checked
 def check_rows(scene: GaussianScene) -> CheckedScene:
     """Drop invalid rows (:func:`invalid_rows`), and warn about them.
 
@@ -94,6 +96,7 @@ def _listed(reasons: Mapping[str, int]) -> str:
     return ", ".join(f"{name} {number:,}" for name, number in reasons.items())
 
 
+@checked
 def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
     """Find the rows that no renderer can draw.
 
@@ -133,6 +136,7 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
     return {name: mask for (name, mask), bad in zip(masks.items(), any_bad, strict=True) if bad}
 
 
+@checked
 def valid_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
     """Return a mask of the rows that renderers can draw."""
     return ~any_row(scene, invalid_rows(scene))
@@ -169,6 +173,7 @@ def with_finite_opacities(scene: GaussianScene) -> GaussianScene:
     return scene.with_tensors({"logit_opacities": finite})
 
 
+@checked
 def standardized(scene: GaussianScene) -> GaussianScene:
     """Clamp opacities to strictly inside (0, 1), and scales to finite ones; normalize quaternions.
 

@@ -20,6 +20,7 @@ from cvtgs.analysis.effects import (
     duplicate_share,
     far_share,
     haze_share,
+    mean_clamped,
     select_columns,
 )
 from cvtgs.errors import InvalidArgumentError
@@ -371,3 +372,16 @@ def test_masses_of_other_gaussians_are_refused():
     scene = random_scene(5)
     with pytest.raises(InvalidArgumentError, match="distances must be one number for each"):
         plan_effects(scene, scene.masses, distances=torch.ones(4))
+
+
+@pytest.mark.parametrize("count", [2000, 50_000])
+def test_colours_below_zero_do_not_depend_on_the_order_of_rows(count):
+    """A few of the Gaussians have most of the mass."""
+    scene = random_scene(count, degree=1, seed=3)
+    scene = scene.with_tensors(log_scales=3.0 * scene.log_scales, sh0=scene.sh0 - 1.0)
+    whole = float(mean_clamped(scene, scene.masses))
+    assert whole > 0.01
+    for seed in range(3):
+        order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
+        mixed = scene.select(order)
+        assert float(mean_clamped(mixed, mixed.masses)) == pytest.approx(whole, rel=1e-9)

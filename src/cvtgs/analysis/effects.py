@@ -5,13 +5,14 @@ from dataclasses import replace
 from itertools import pairwise
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cvtgs.config import EffectsConfig, SimplifyConfig
 from cvtgs.config.base import Record
-from cvtgs.devices import chunk_length, row_chunks
+from cvtgs.devices import chunk_length
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.math.frames import hashed_rows
 from cvtgs.math.parameters import MIN_ALPHA, divide, opacity_from_logit
 from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0, clamped_parts
 from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
@@ -31,12 +32,10 @@ DUPLICATE_SHARE = 0.01
 CLAMPED = 2e-3  # if colours below zero take less of full brightness, 0.02 dB can be gained
 UNBOUNDED_DISTANCE = 3.0  # distance beyond which Gaussians count as far away, in robust radii
 SAMPLE = 1 << 14
-"""Approximate size of the sample, evenly spaced in the rows, that is examined first."""
+"""Approximate size of samples: of bands, which are examined first, and of colours below zero."""
 
 HASHED = 1 << 12  # smallest expected size of the sample in which duplicates are counted
 CHUNK = 1 << 14
-
-_FACTORS = (0x1E3779B97F4A7C15, 0x3F58476D1CE4E5B9, 0x14D049BB133111EB)  # odd, of 62 bits at most
 LEAST_CONTRAST = 1e-6  # floor of the contrast, for scenes of a single colour
 
 
@@ -293,38 +292,22 @@ def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) ->
     For large scenes it is estimated from a sample, which is chosen by a hash of the position, so
     that duplicates are sampled together. A crowd at one position counts wholly or not at all.
     """
-    bits = max(0, math.floor(math.log2(max(1, len(means)) / HASHED)))
-    rows, hashes = [], []
-    for part in row_chunks(len(means), CHUNK << 2, means.device):
-        keys = _hash(means[part])
-        chosen = (keys & ((1 << bits) - 1) == 0).nonzero()[:, 0]
-        rows.append(chosen + part.start)
-        hashes.append(keys[chosen])
-    sample = torch.cat(rows)
-    sample = sample[torch.sort(torch.cat(hashes), stable=True).indices]
+    sample = hashed_rows(means, HASHED)
     place, color = means[sample], sh0[sample, 0]
     same = (place[1:] == place[:-1]).all(dim=1) & (color[1:] == color[:-1]).all(dim=1)
     return same.sum().double() / max(1, len(sample))
 
 
 def mean_clamped(scene: GaussianScene, masses: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Return how far colours are below zero, as a mean over a sample, by mass, and directions."""
-    step = max(1, len(masses) // (SAMPLE >> 2))
-    clamped = SH_C0 * clamped_parts(scene.sh0[::step], scene.shN[::step])[:, 0].mean(dim=1)
-    sample = masses[::step].double()
-    return divide((sample * clamped).sum(), sample.sum())
+    """Return how far colours are below zero, as a mean over a sample, by mass, and directions.
 
-
-def _hash(means: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
-    """Hash positions; equal positions give equal hashes, which may be negative.
-
-    Rounded coordinates end with many zero bits, so upper bits must reach the lower ones.
+    The sample does not depend on the order of the rows, and is large: a few heavy Gaussians may
+    hold most of the mass.
     """
-    whole = torch.int32 if means.dtype == torch.float32 else torch.int64
-    bits = (means + 0.0).contiguous().view(whole).long()  # no -0.0
-    x, y, z = (bits ^ (bits >> 32)).unbind(1)
-    mixed = x * _FACTORS[0] + y * _FACTORS[1] + z * _FACTORS[2]  # wraps round
-    return (mixed ^ (mixed >> 32)) * _FACTORS[0] >> 16
+    sample = hashed_rows(scene.means, SAMPLE)
+    clamped = SH_C0 * clamped_parts(scene.sh0[sample], scene.shN[sample])[:, 0].mean(dim=1)
+    weights = masses[sample].double()
+    return divide((weights * clamped).sum(), weights.sum())
 
 
 def select_columns(scene: GaussianScene, choices: EffectsConfig) -> GaussianScene:

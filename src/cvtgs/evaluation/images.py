@@ -14,6 +14,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
+from cvtgs.checks import checked
 from cvtgs.errors import (
     FileFormatError,
     InputError,
@@ -169,6 +170,7 @@ def _colors_of(
     return np.stack(channels, axis=2).round().astype(np.uint8)
 
 
+@checked
 def load_photographs(
     folder: str | os.PathLike[str],
     cameras: Cameras,
@@ -213,6 +215,7 @@ def load_photographs(
     return torch.from_numpy(np.stack([read_image(path, size, background) for path in paths]))
 
 
+@checked
 def fit_cameras(cameras: Cameras, folder: str | os.PathLike[str]) -> Cameras:
     """Resize cameras to their photographs if those are smaller, as in ``images_4``.
 

@@ -138,6 +138,8 @@ def scene_size(path: str | os.PathLike[str]) -> int:
     patterns = {"meta.json": ("*.webp",), "lod-meta.json": streamed}.get(file.name, ())
     parts = [part for pattern in patterns for part in file.parent.glob(pattern)]
     with input_errors(file):
+        if not is_file(file):  # also a name that no file can have
+            raise FileNotFoundError
         return sum(part.stat().st_size for part in (file, *parts))
 
 

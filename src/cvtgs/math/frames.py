@@ -1,4 +1,4 @@
-"""The robust frame of a scene, and the order of points along a Morton curve."""
+"""The robust frame of a scene, and orders of points: along a Morton curve, and by hashes."""
 
 import math
 from dataclasses import dataclass
@@ -22,6 +22,7 @@ _SPREAD = (
     (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
 )
+_FACTORS = (0x1E3779B97F4A7C15, 0x3F58476D1CE4E5B9, 0x14D049BB133111EB)  # odd, of 62 bits at most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -215,3 +216,35 @@ def _spread_bits(values: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
     for shift, mask in _SPREAD:
         values = (values << shift).bitwise_or_(values).bitwise_and_(mask)
     return values
+
+
+def hashed_rows(means: Float[Tensor, "n 3"], least: int) -> Int[Tensor, "s"]:
+    """Sample rows in an order that only depends on the positions: that of their hashes.
+
+    Args:
+        means: Positions.
+        least: Least number of rows to expect; the sample has up to twice as many, or all rows.
+
+    Returns:
+        Rows; of coincident points, all or none.
+    """
+    bits = max(0, math.floor(math.log2(max(1, len(means)) / least)))
+    rows, hashes = [], []
+    for part in row_chunks(len(means), CHUNK, means.device):
+        keys = _hash(means[part])
+        chosen = (keys & ((1 << bits) - 1) == 0).nonzero()[:, 0]
+        rows.append(chosen + part.start)
+        hashes.append(keys[chosen])
+    return torch.cat(rows)[torch.sort(torch.cat(hashes), stable=True).indices]
+
+
+def _hash(means: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+    """Hash positions; equal positions give equal hashes, which may be negative.
+
+    Rounded coordinates end with many zero bits, so upper bits must reach the lower ones.
+    """
+    whole = torch.int32 if means.dtype == torch.float32 else torch.int64
+    bits = (means + 0.0).contiguous().view(whole).long()  # no -0.0
+    x, y, z = (bits ^ (bits >> 32)).unbind(1)
+    mixed = x * _FACTORS[0] + y * _FACTORS[1] + z * _FACTORS[2]  # wraps round
+    return (mixed ^ (mixed >> 32)) * _FACTORS[0] >> 16
