@@ -150,7 +150,7 @@ def clamped_parts(
         0.25
     """
     basis, fit = _fit(degree_of(shN.shape[1]), sh0.device)
-    offset, parts = basis.new_full((), -0.5), []
+    offset, parts = basis.new_full((), -0.5), [basis.new_zeros(len(fit), 0, 3)]
     for rows in row_chunks(len(sh0), CHUNK, sh0.device):
         columns = torch.cat([sh0[rows], shN[rows]], dim=1).double().permute(1, 0, 2).flatten(1)
         below = torch.addmm(offset, -basis, columns).clamp_min_(0)

@@ -23,7 +23,7 @@ from cvtgs.errors import (
     warn,
 )
 from cvtgs.io.tensors import pack_tensors, unpack_tensors
-from cvtgs.mergenet.model import Architecture, MergeNet
+from cvtgs.mergenet.model import Architecture, MergeNet, without_weights
 from cvtgs.mergenet.published import Net, PublishedArchitecture, PublishedMergeNet
 from cvtgs.text import printable, printable_name, short_repr, shown
 
@@ -250,15 +250,15 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
 
 
 def build_network(architecture: Architecture | PublishedArchitecture) -> Net:
-    """Build an untrained network in the default dtype on the default device."""
+    """Build an untrained network in float32 on the CPU."""
     if isinstance(architecture, PublishedArchitecture):
         return PublishedMergeNet(architecture)
     return MergeNet(architecture)
 
 
 def _build_net(info: CheckpointInfo, tensors: dict[str, Tensor], name: str) -> Net:
-    with torch.device("meta"):  # neither draws random weights nor needs another default dtype
-        net = build_network(info.architecture).float()
+    with without_weights():
+        net = build_network(info.architecture)
     if isinstance(net, MergeNet) and not any(key.startswith(KNOWN) for key in tensors):
         own = net.state_dict()
         tensors = tensors | {key: own[key] for key in own if key.startswith(KNOWN)}
@@ -272,7 +272,7 @@ def _build_net(info: CheckpointInfo, tensors: dict[str, Tensor], name: str) -> N
         )
     if not all(bool(torch.isfinite(values).all()) for values in tensors.values()):
         raise CheckpointError(f"{name}: the checkpoint holds weights that are not finite.")
-    net.load_state_dict({key: values.clone() for key, values in tensors.items()}, assign=True)
+    net.load_state_dict(tensors)
     return net.eval().requires_grad_(False)
 
 

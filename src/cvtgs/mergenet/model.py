@@ -2,7 +2,9 @@
 
 import copy
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
@@ -48,6 +50,8 @@ the known range, so that corrections fade.
 Larger cells occur in the middle of unbounded scenes where most cells are spent on the sky. They
 cover the cameras when they grow, so the limit holds whatever the training cases contain.
 """
+
+_TO_BE_LOADED = ContextVar("_TO_BE_LOADED", default=False)
 
 WIDEST = 1e30  # absolute value of both ends of the range before it is fitted
 
@@ -160,7 +164,7 @@ class MergeNet(CellNetwork):
         self.member_layers = two_layers(architecture.member_features, width)
         self.pair_layers = two_layers(architecture.pair_features, width)
         self.cell_layers = two_layers(pooled, cell_width)
-        self.decoder = nn.Linear(cell_width, 4)
+        self.decoder = Linear(cell_width, 4)
         self.member_gates = _Gates(width, cell_width)
         self.pair_gates = _Gates(width, cell_width)
         self.known = KnownRange()
@@ -226,9 +230,9 @@ class _Gates(nn.Module):
 
     def __init__(self, width: int, cell_width: int) -> None:
         super().__init__()
-        self.own = nn.Linear(width, width)
-        self.cell = nn.Linear(cell_width, width, bias=False)
-        self.gates = nn.Linear(width, 5)
+        self.own = Linear(width, width)
+        self.cell = Linear(cell_width, width, bias=False)
+        self.gates = Linear(width, 5)
         self.activation = _SiLU()
         nn.init.zeros_(self.gates.weight)
         nn.init.zeros_(self.gates.bias)
@@ -241,9 +245,31 @@ class _Gates(nn.Module):
         return torch.tanh(torch.addmm(self.gates.bias[:, None], self.gates.weight, hidden.T)).T
 
 
+class Linear(nn.Linear):
+    """A layer in float32 on the CPU, whatever the defaults of the program, with random weights."""
+
+    def __init__(self, features: int, width: int, *, bias: bool = True) -> None:
+        super().__init__(features, width, bias=bias, device="cpu", dtype=torch.float32)
+
+    def reset_parameters(self) -> None:
+        """Draw random weights, unless they are going to be loaded."""
+        if not _TO_BE_LOADED.get():
+            super().reset_parameters()
+
+
+@contextmanager
+def without_weights() -> Iterator[None]:
+    """Build networks without weights in this thread, so that no random numbers are drawn."""
+    token = _TO_BE_LOADED.set(True)
+    try:
+        yield
+    finally:
+        _TO_BE_LOADED.reset(token)
+
+
 def two_layers(features: int, width: int) -> nn.Sequential:
     """Return two linear layers of a width, each with its activation."""
-    return nn.Sequential(nn.Linear(features, width), _SiLU(), nn.Linear(width, width), _SiLU())
+    return nn.Sequential(Linear(features, width), _SiLU(), Linear(width, width), _SiLU())
 
 
 def _pool_pairs(pairs: Float[Tensor, "m k w"]) -> tuple[Tensor, Tensor]:

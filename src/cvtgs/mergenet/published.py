@@ -11,7 +11,7 @@ from cvtgs.cells import Partition
 from cvtgs.config.base import Record
 from cvtgs.math import parameters
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
-from cvtgs.mergenet.model import CellNetwork, CellWidth, MergeNet, Width, two_layers
+from cvtgs.mergenet.model import CellNetwork, CellWidth, Linear, MergeNet, Width, two_layers
 from cvtgs.scene import GaussianScene
 
 SH_COEFFICIENTS = 16
@@ -146,7 +146,7 @@ class PublishedMergeNet(CellNetwork):
         width, cell_width = architecture.width, architecture.cell_width
         self.member_layers = two_layers(architecture.member_features, width)
         self.decoder = two_layers(3 * width, cell_width)
-        self.residuals = nn.Linear(cell_width, PUBLISHED_RESIDUALS)
+        self.residuals = Linear(cell_width, PUBLISHED_RESIDUALS)
         nn.init.zeros_(self.residuals.weight)
         nn.init.zeros_(self.residuals.bias)
 

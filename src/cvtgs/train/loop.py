@@ -168,8 +168,7 @@ def _first_net(config: TrainConfig) -> Net:
         return net
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        with in_float32(), torch.device("cpu"):  # the program may have other defaults
-            return build_network(shape)
+        return build_network(shape)
 
 
 def _prepare_scenes(
