@@ -96,7 +96,6 @@ def _listed(reasons: Mapping[str, int]) -> str:
     return ", ".join(f"{name} {number:,}" for name, number in reasons.items())
 
 
-@checked
 def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
     """Find the rows that no renderer can draw.
 
@@ -136,7 +135,6 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
     return {name: mask for (name, mask), bad in zip(masks.items(), any_bad, strict=True) if bad}
 
 
-@checked
 def valid_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
     """Return a mask of the rows that renderers can draw."""
     return ~any_row(scene, invalid_rows(scene))
@@ -173,7 +171,6 @@ def with_finite_opacities(scene: GaussianScene) -> GaussianScene:
     return scene.with_tensors({"logit_opacities": finite})
 
 
-@checked
 def standardized(scene: GaussianScene) -> GaussianScene:
     """Clamp opacities to strictly inside (0, 1), and scales to finite ones; normalize quaternions.
 

@@ -142,21 +142,17 @@ def test_the_cameras_of_a_model_folder_are_found(tmp_path: Path) -> None:
     assert len(load_cameras(inria_model(tmp_path))) == 12
 
 
-def test_the_last_step_of_a_splatfacto_run_is_read(tmp_path: Path) -> None:
-    steps = tmp_path / "nerfstudio_models"
+@pytest.mark.parametrize(
+    ("folder", "name"),
+    [("nerfstudio_models", "step-{:09}.ckpt"), ("ckpts", "ckpt_{}_rank0.pt")],
+    ids=["nerfstudio", "gsplat"],
+)
+def test_the_last_step_of_a_run_is_read(tmp_path: Path, folder: str, name: str) -> None:
+    steps = tmp_path / folder
     steps.mkdir()
     for step, count in ((999, 3), (29999, 5)):
         state = {"step": step, "splats": to_dict(random_scene(count))}
-        torch.save(state, steps / f"step-{step:09}.ckpt")
-    assert len(load(tmp_path)) == len(load(steps)) == 5
-
-
-def test_the_last_step_of_a_run_of_gsplat_is_read(tmp_path: Path) -> None:
-    steps = tmp_path / "ckpts"
-    steps.mkdir()
-    for step, count in ((999, 3), (29999, 5)):
-        state = {"step": step, "splats": to_dict(random_scene(count))}
-        torch.save(state, steps / f"ckpt_{step}_rank0.pt")
+        torch.save(state, steps / name.format(step))
     assert len(load(tmp_path)) == len(load(steps)) == 5
 
 

@@ -90,10 +90,16 @@ def test_loading_changes_no_state_of_the_process_even_for_a_moment(path, name, m
     """Other threads would see other random numbers, or another default dtype."""
     shipped = load_checkpoint(name)
     path.write_bytes(encode_checkpoint(shipped.net, shipped.info))
-    for function in ("torch.set_default_dtype", "torch.set_rng_state", "torch.manual_seed"):
-        monkeypatch.setattr(function, pytest.fail)
-    before = torch.get_rng_state()
-    load_checkpoint(path)
+    before, dtype = torch.get_rng_state(), torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        with monkeypatch.context() as patched:
+            for place in ("set_default_dtype", "random.set_rng_state", "nn.init.kaiming_uniform_"):
+                patched.setattr(f"torch.{place}", pytest.fail)
+            net = load_checkpoint(path).net
+    finally:
+        torch.set_default_dtype(dtype)
+    assert {values.dtype for values in net.state_dict().values()} == {torch.float32}
     assert torch.equal(torch.get_rng_state(), before)
 
 

@@ -2,7 +2,7 @@
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -24,10 +24,13 @@ class ReportFile:
 
     def add(self, job: SceneJob, report: "SimplifyReport") -> None:
         """Write the report of one scene; keep that of one of many."""
+        if self._options.report is None:
+            return
+        text = report.to_json()
         if job.is_one_of_many:
-            self._keep(job, report=json.loads(report.to_json()))
-        elif self._options.report is not None:
-            self._write(report.to_json(), f"the scene {job.options.output} was")
+            self._keep(job, report=json.loads(text))
+        else:
+            self._write(text, f"the scene {job.options.output} was")
 
     def add_error(self, job: SceneJob, error: Exception) -> None:
         """Keep the error of one of many scenes."""
@@ -55,7 +58,7 @@ class ReportFile:
 
 
 @contextmanager
-def report_file(options: argparse.Namespace, jobs: Sequence[SceneJob]) -> Iterator[ReportFile]:
+def report_file(options: argparse.Namespace) -> Iterator[ReportFile]:
     """Check that the file can be written; at the end, write the entries of many scenes.
 
     They are written even if some of the scenes failed.

@@ -170,7 +170,7 @@ def simplify(options: argparse.Namespace) -> None:
         for job in jobs[1:]:
             job.options.recalibrate = False  # once is enough
 
-        with report_file(options, jobs) as file:
+        with report_file(options) as file:
 
             def work(job: SceneJob) -> Outcome:
                 outcome, report = _simplify_one(job, checkpoint, config, settings)

@@ -310,7 +310,7 @@ def scene_scores(
     """
     psnrs, ssims, distances, errors, biases = zip(*rows, strict=True)
     has_alpha = not any(map(math.isnan, errors))
-    counted = [view for view in range(len(rows)) if view not in {*blind}] or range(len(rows))
+    counted = [view for view in range(len(rows)) if view not in blind] or range(len(rows))
 
     def score(values: tuple[float, ...]) -> Score:
         return Score(mean=Score.of([values[view] for view in counted]).mean, views=values)
