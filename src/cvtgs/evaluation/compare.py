@@ -30,8 +30,10 @@ from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.rendering import choose_backend
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.text import printable_name, short_repr, shown
+from cvtgs.views import automatic_views, find_own_cameras
 
 STAGE = "evaluate"  # stage name in progress events; one step per image
+OWN_CAMERAS, OWN_SIZE = 8, 640  # number and longer side of images from cameras beside a scene
 ROUNDING = 1e-3  # values of photographs may be outside [0, 1] by this much, as in half precision
 
 Images = UInt8[np.ndarray, "c h w 3"]
@@ -90,7 +92,7 @@ class Comparison:
 def evaluate(
     reference: SceneLike,
     small: Mapping[str, SceneLike],
-    cameras: Cameras,
+    cameras: Cameras | None = None,
     *,
     reference_name: str = "full",
     photographs: Float[Tensor, "c h w 3"] | None = None,
@@ -106,7 +108,8 @@ def evaluate(
     Args:
         reference: The full scene, or a file or folder of one.
         small: Simplified scenes, or files of them, by name.
-        cameras: The cameras.
+        cameras: The cameras; None takes 8 of those beside the file of the full scene, in images of
+            640 pixels, or else automatic views (:func:`cvtgs.views.automatic_views`).
         reference_name: Name of the full scene.
         photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too.
         settings: Background, LPIPS network and backend.
@@ -133,6 +136,7 @@ def evaluate(
         inf
     """
     scenes = _named_scenes(reference, small, reference_name)
+    cameras = _chosen_cameras(cameras, reference, scenes[reference_name], photographs)
     return _score_images(
         scenes, cameras, photographs=photographs, settings=settings, listener=listener
     )
@@ -141,7 +145,7 @@ def evaluate(
 def compare(  # noqa: PLR0913 (options by name)
     reference: SceneLike,
     small: Mapping[str, SceneLike],
-    cameras: Cameras,
+    cameras: Cameras | None = None,
     *,
     reference_name: str = "full",
     sizes: Mapping[str, int] | None = None,
@@ -157,7 +161,7 @@ def compare(  # noqa: PLR0913 (options by name)
     Args:
         reference: The full scene, or a file or folder of one.
         small: Simplified scenes, or files of them, by name.
-        cameras: The cameras.
+        cameras: The cameras; None chooses as for :func:`evaluate`.
         reference_name: Name of the full scene.
         sizes: File sizes in bytes, by name.
         most_images: Keep the images of at most this many views, spread over their order; scores
@@ -191,7 +195,8 @@ def compare(  # noqa: PLR0913 (options by name)
             raise InvalidArgumentError(
                 f"sizes must be those of {', '.join(scenes)}; found one of {shown(name)}."
             )
-    views = spread_rows(len(checked_cameras(cameras)), most_images or len(cameras))
+    cameras = _chosen_cameras(cameras, reference, scenes[reference_name], photographs)
+    views = spread_rows(len(cameras), most_images or len(cameras))
     shape = (len(views), cameras.height, cameras.width)
     images = {
         name: SceneImages(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8))
@@ -240,6 +245,20 @@ def _named_scenes(
         )
     read = {name: as_scene(one, f"scene {name!r}") for name, one in small.items()}
     return {reference_name: as_scene(reference, "reference"), **read}
+
+
+def _chosen_cameras(
+    cameras: Cameras | None, source: SceneLike, scene: GaussianScene, photographs: Tensor | None
+) -> Cameras:
+    """Return given cameras, those beside the file of the scene, or automatic ones."""
+    if cameras is not None:
+        return checked_cameras(cameras)
+    if photographs is not None:
+        raise InvalidArgumentError("photographs need the cameras that took them; found none.")
+    own = None if isinstance(source, GaussianScene) else find_own_cameras(scene, source)
+    if own is not None:
+        return own.cameras.spread(OWN_CAMERAS).fitted(OWN_SIZE)
+    return automatic_views(scene)
 
 
 def _check_photographs(photographs: Float[Tensor, "c h w 3"], cameras: Cameras) -> None:
