@@ -129,18 +129,9 @@ def importance_by_errors(
     """Return factors on the masses in the costs of merging: larger where cells have larger errors.
 
     The errors of neighbouring cells count by half, since errors are also caused by what a cell does
-    not cover. Cells that images hardly show have factors near 1.
-
-    Args:
-        small: One Gaussian per cell.
-        partition: Rows of every cell.
-        errors: Squared errors that each cell causes in images.
-        pixels: Contribution of each cell to these images, pixels.
-        count: Number of Gaussians of the full scene.
-        power: Power of the errors.
-
-    Returns:
-        Factor of each Gaussian of the full scene; 1 for Gaussians in no cell.
+    not cover. Cells that images hardly show have factors near 1. ``errors`` are squared, ``pixels``
+    is the contribution of each cell to the images, and ``count`` the size of the full scene, whose
+    Gaussians in no cell have factor 1.
     """
     near = cvt.nearest_neighbors(small.means, NEAR)
     errors = errors.nan_to_num(0.0, 0.0, 0.0)  # images of extreme scenes overflow

@@ -84,8 +84,6 @@ class Prepared:
     ) -> None:
         check_cameras(cameras, config)
         self._scene, self._config, self._checkpoint = scene, config, checkpoint
-        self._total = len(scene)
-        self._refines = config.refine.enabled
         self._cameras, self._listener = cameras, listener
         self._device = device or chosen_device("auto", scene.device)
         self._may_leave = device is None
@@ -122,7 +120,7 @@ class Prepared:
         Returns:
             The scene and the report.
         """
-        total = self._total
+        total = len(self._scene)
         target = target_count(total, rho, count=count, max_count=max_count)
         mask = None if keep is None else checked_mask(keep, total)
         return self._attempt(partial(self._run, target, mask))
@@ -142,7 +140,7 @@ class Prepared:
             self._device_note = note or self._move_note
             return compute()
 
-        work = f"simplifying {self._total:,} Gaussians"
+        work = f"simplifying {len(self._scene):,} Gaussians"
         with (
             threads_for_chunks() if self._config.uses_images else without_spinning(),
             torch.inference_mode(mode=False),
@@ -179,7 +177,7 @@ class Prepared:
         Args:
             rho: The largest ratio to expect.
         """
-        self._attempt(partial(self._warm_up, target_count(self._total, rho)))
+        self._attempt(partial(self._warm_up, target_count(len(self._scene), rho)))
 
     def _warm_up(self, target: int) -> None:
         clock = StageClock(silent, self._device)
@@ -199,7 +197,7 @@ class Prepared:
             ratios = []
         if not ratios:
             raise InvalidArgumentError(f"levels need a list of ratios, found {shown(rhos)}.")
-        targets = [target_count(self._total, rho) for rho in ratios]
+        targets = [target_count(len(self._scene), rho) for rho in ratios]
         found = self._attempt(partial(self._run_levels, targets))
         return tuple(found[target] for target in targets)
 
@@ -276,7 +274,7 @@ class Prepared:
             config=self._config,
             net=self._net,
             clock=clock,
-            total=self._total if kept is None else self._total - len(kept),
+            total=len(self._scene) if kept is None else len(self._scene) - len(kept),
             ordered=self._ordered if kept is None else None,
         )
         found, power, observed = reduce(analysis), self._config.match.error_power, analysis.observed
@@ -341,12 +339,12 @@ class Prepared:
         kept_count: int = 0,
     ) -> Simplified:
         """Report, restore columns that were left out, and refine if the configuration says so."""
-        scene, total = self._scene, self._total
+        scene, total = self._scene, len(self._scene)
         masses = [analysis.masses.sum(), reduced.scene.masses.sum()]
         mass_in, mass_out = torch.stack(masses).tolist()
         views = "none"
         is_whole = target >= total - checked.invalid_count
-        if not is_whole and (self._refines or analysis.plan.visibility.active):
+        if not is_whole and (self._config.refine.enabled or analysis.plan.visibility.active):
             views = origin_of_views(self._cameras)
         report = SimplifyReport(
             input_count=total,
@@ -371,7 +369,7 @@ class Prepared:
         )
         small = restore_columns(reduced.scene, scene, analysis.plan).to(scene.means.device)
         result = Simplified(small, report)
-        if not self._refines or is_whole:
+        if not self._config.refine.enabled or is_whole:
             return result
         return self._refine(result, analysis)
 

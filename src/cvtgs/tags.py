@@ -6,15 +6,10 @@ from typing import NamedTuple
 
 
 class Tag(NamedTuple):
-    """A tag, as cvtgs writes it and as it recognises it.
-
-    Attributes:
-        text: The comment.
-        pattern: Matches this comment, and those with the same meaning of other tools.
-    """
+    """A tag, as cvtgs writes it and as it recognises it."""
 
     text: str
-    pattern: re.Pattern[str]
+    pattern: re.Pattern[str]  # also matches comments of other tools with this meaning
 
     def is_in(self, comments: Iterable[str]) -> bool:
         """Return whether any comment is this tag."""

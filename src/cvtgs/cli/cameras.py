@@ -61,12 +61,10 @@ def add_view_options(parser: argparse.ArgumentParser, *, size: int, **helps: str
 
 def check_view_options(options: argparse.Namespace) -> None:
     """Check the options of :func:`add_view_options` before any file is read."""
-    for name in ("views", "size"):
+    for name, most in (("views", _MOST_VIEWS), ("size", _MOST_SIZE)):
         value = getattr(options, name)
         if value is not None and value < 1:
             raise InvalidArgumentError(f"--{name} must be at least 1, found {value}.")
-    for name, most in (("views", _MOST_VIEWS), ("size", _MOST_SIZE)):
-        value = getattr(options, name)
         if value is not None and value > most:
             raise InvalidArgumentError(f"--{name} must be at most {most:,}, found {value:,}.")
     check_split(options)

@@ -26,18 +26,11 @@ STARTED = time.perf_counter()  # approximate start of this process, from which a
 
 
 class ChosenPreset(NamedTuple):
-    """A preset, why it was chosen, the time left for the run, and advice if it takes longer.
-
-    Attributes:
-        name: Name of the preset.
-        reason: The sentence that explains the choice.
-        left: Seconds that are left for the run.
-        advice: What to do if it takes longer.
-    """
+    """A preset, why it was chosen, the time left for the run, and advice if it takes longer."""
 
     name: str
     reason: str
-    left: float
+    left: float  # seconds
     advice: str
 
     def late_note(self, seconds: float) -> list[str]:

@@ -50,9 +50,7 @@ class ReportFile:
         options = self._options
         try:
             write_atomically(options.report, text.encode(), overwrite=options.overwrite)
-        except OSError as error:
-            if not isinstance(error, OutputError | OutputExistsError):
-                raise
+        except (OutputError, OutputExistsError) as error:
             reason = str(error).removesuffix("; nothing was written.").rstrip(".")
             raise OutputError(f"{reason}; {written} written, the report was not.") from error
 

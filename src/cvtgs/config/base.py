@@ -75,12 +75,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def read_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a TOML file, or from a ``.json`` file the configuration of a report.
-
-    Raises:
-        ConfigError: The file cannot be read, or holds neither.
-        InvalidArgumentError: ``path`` is no path.
-    """
+    """Read a TOML file, or from a ``.json`` file the configuration of a report."""
     check_path(path)
     if Path(path).suffix.lower() != ".json":
         return read_toml(path)

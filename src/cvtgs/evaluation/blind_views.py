@@ -40,7 +40,9 @@ def check_seen(
         blind = [camera for camera in blind if not camera.shows_any(exact)]
         if 2 * len(blind) <= len(cameras):
             return
-    empty = sum(_is_empty(scene, camera.fitted(PREVIEW), backend) for camera in blind)
+    images = (render_views(scene, camera.fitted(PREVIEW), backend=backend) for camera in blind)
+    # Gaussians beside an image may reach into it
+    empty = sum(float(image.alpha.mean()) < LEAST_COVER for image in images)
     if empty == len(cameras):
         raise InvalidArgumentError(
             f"the cameras must see {name}, found nothing of it in any of {len(cameras)} "
@@ -67,8 +69,3 @@ def _drawn(scene: GaussianScene) -> Float[Tensor, "n 3"]:
     """Return the positions of the Gaussians that renderers draw; all, if they draw none."""
     is_drawn = scene.opacities >= MIN_ALPHA
     return scene.means[is_drawn] if bool(is_drawn.any()) else scene.means
-
-
-def _is_empty(scene: GaussianScene, camera: Cameras, backend: BackendName) -> bool:
-    """Return whether an image shows nothing, though Gaussians beside it may reach into it."""
-    return float(render_views(scene, camera, backend=backend).alpha.mean()) < LEAST_COVER

@@ -24,13 +24,8 @@ _HERE, _NO_REPLACE = -100, 1
 """AT_FDCWD and RENAME_NOREPLACE of Linux."""
 
 _WINDOWS = os.name == "nt"
-_RESERVED = {
-    "CON",
-    "PRN",
-    "AUX",
-    "NUL",
-    *(f"{port}{n}" for port in ("COM", "LPT") for n in "123456789"),
-}
+_RESERVED = {"CON", "PRN", "AUX", "NUL"}
+_RESERVED |= {f"{port}{n}" for port in ("COM", "LPT") for n in "123456789"}
 
 _MOST_WRITERS = 16
 """Largest number of concurrent writers of an output whose leftovers are found after a kill."""

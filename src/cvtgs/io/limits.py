@@ -1,6 +1,6 @@
 """Limits of each format, and the data of a scene that is lost in it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -46,18 +46,12 @@ class FormatLimits:
     """Whether files record that Gaussians are flat; files with comments do so by a tag."""
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Minimum and maximum of the values of a tensor, by its name."""
-    largest_coordinate: Callable[[GaussianScene], float] | None = None
-    """Computes the largest coordinate that a file of a scene can hold; None if unlimited."""
+    fixed_point: bool = False
+    """Whether files hold positions in fixed point, so that coordinates are limited."""
     changed: tuple[str, ...]
     """Phrases for data that are rounded or reordered."""
     changed_bands: str = ""
     """The same for the SH bands above the constant one."""
-
-
-def _largest_spz_coordinate(scene: GaussianScene) -> float:
-    from cvtgs.io.spz.write import largest_coordinate  # noqa: PLC0415 (only where it is written)
-
-    return largest_coordinate(scene)
 
 
 LOST_DIGITS = "digits of positions"
@@ -72,7 +66,7 @@ _SPZ = FormatLimits(  # of versions 3 and 4
         "sh0": (-3.3464, 3.3464),
         "shN": (-1.0625, 1.0625),
     },
-    largest_coordinate=_largest_spz_coordinate,
+    fixed_point=True,
     changed=(
         "positions in steps of 1/4096 (finer in scenes below 8 units, coarser beyond 2,048 units "
         "from the origin)",
@@ -205,8 +199,10 @@ def dropped_within(scene: GaussianScene, limits: FormatLimits) -> dict[str, int]
     ranges, step = dict(limits.ranges), 0.0
     if scene.dtype == torch.float64:
         step = lost_step(scene, in_file=True)
-    if limits.largest_coordinate is not None:
-        largest = limits.largest_coordinate(scene)
+    if limits.fixed_point:
+        from cvtgs.io.spz.write import largest_coordinate  # noqa: PLC0415 (only where written)
+
+        largest = largest_coordinate(scene)
         ranges["means"] = (-largest, largest)
         if largest / SPZ_STEPS > _USUAL_SPZ_STEP:
             step = max(step, coarse_step(scene, largest / SPZ_STEPS))

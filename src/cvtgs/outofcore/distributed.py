@@ -229,7 +229,8 @@ class ClusterWorkers:
                     wait([future], timeout=ANSWER_SECONDS)
                     break
                 except TimeoutError as error:
-                    unanswered = 0 if self._is_at_work() else unanswered + 1
+                    works = self._client.status == "running" and self._addresses()
+                    unanswered = 0 if works else unanswered + 1
                     if unanswered > 1:
                         raise _gone() from error
             try:
@@ -249,10 +250,6 @@ class ClusterWorkers:
             f"{MAX_DEATHS} rounds of workers died on the same task; give them more memory or lower "
             "--memory, and run the same command again to continue."
         )
-
-    def _is_at_work(self) -> bool:
-        """Return whether the scheduler answers and has workers."""
-        return self._client.status == "running" and bool(self._addresses())
 
 
 def _has_no_cvtgs(address: str, found: str) -> RunError:

@@ -169,7 +169,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         boxes=tuple(listed(boxes, Box, required="boxes must be of type Box")),
         config=simplifier.config,
         has_network=simplifier.checkpoint is not None,
-        range_rows=whole_number(range_rows),
+        range_rows=range_rows,
         sample_rows=sample_rows(room),
         cell_room=min(cell_room(memory), most_cells(target, rows.count, allocation)),
         axes=checked_axes(output_axes or SCENE_AXES) if is_plain_ply(output) else SCENE_AXES,

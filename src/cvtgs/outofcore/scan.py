@@ -115,10 +115,9 @@ def _weighted_quantile(coordinates: Tensor, weights: Tensor, share: float) -> fl
 
 
 SAMPLE_ROWS = 1 << 18  # size of the sample from which frame, effect plan and partition are computed
-CHUNK = 1 << 15  # number of rows that are read together
+CHUNK = 1 << 15  # number of rows that are read together, and mapped together for a sample
 DEVIATIONS = 4.0  # standard deviations of the number of rows that a filter from the sample leaves
 _GOLDEN = 0.6180339887498949  # multiples of it are spread evenly between whole numbers
-MAPPED_ROWS = 1 << 15  # number of rows of the file that are mapped together while a sample is read
 
 
 class RowRange(NamedTuple):
@@ -182,7 +181,7 @@ def read_sample(source: PlyRows, count: int) -> GaussianScene:
     Which of the k differs, so that a sample of rows in a periodic order is not one-sided.
     """
     step = max(1, source.count // count)
-    rows = step * max(1, MAPPED_ROWS // step)
+    rows = step * max(1, CHUNK // step)
     starts = range(0, source.count, rows)
     ends = (min(start + rows, source.count) for start in starts)
     parts = (_one_of(source.read(*span), step) for span in zip(starts, ends, strict=True))

@@ -46,9 +46,15 @@ prange = numba.prange
 """A range whose steps run in parallel in functions compiled by :func:`parallel`."""
 
 
-def serial(function: F) -> F:
+def serial(function: F, **settings: bool) -> F:
     """Compile a function at its first call."""
-    return _compiled(function)
+    compiler = partial(
+        numba.njit, nogil=True, error_model="numpy", fastmath={"contract"}, **settings
+    )
+    try:
+        return cast("F", compiler(cache=True)(function))
+    except RuntimeError:  # no cache folder is writable
+        return cast("F", compiler()(function))
 
 
 def parallel(function: F) -> F:
@@ -57,7 +63,7 @@ def parallel(function: F) -> F:
     It uses as many threads as torch. Without OpenMP and TBB, the threads of numba take one loop at
     a time and end the process at a second one; so threads of the program wait for each other there.
     """
-    compiled = _compiled(function, parallel=True)
+    compiled = serial(function, parallel=True)
 
     @wraps(function)
     def call(*arguments: Any) -> object:
@@ -85,16 +91,6 @@ def for_each_camera(
     """
     at_a_time = len(cameras) > 1 and takes_several_loops()
     yield from in_threads(function, cameras, HOST) if at_a_time else map(function, cameras)
-
-
-def _compiled(function: F, **settings: bool) -> F:
-    compiler = partial(
-        numba.njit, nogil=True, error_model="numpy", fastmath={"contract"}, **settings
-    )
-    try:
-        return cast("F", compiler(cache=True)(function))
-    except RuntimeError:  # no cache folder is writable
-        return cast("F", compiler()(function))
 
 
 @contextmanager

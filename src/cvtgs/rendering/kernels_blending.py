@@ -27,12 +27,6 @@ def copy_splats(packed: Array, lists: Ints, first: int, end: int, batch: Array) 
 
 
 @serial
-def none_open(open_rows: Ints) -> bool:
-    """Return whether all pixels of a tile are finished."""
-    return not open_rows.any()
-
-
-@serial
 def reached_columns(splat: Array, room: float, box: PixelBox) -> int:
     """Return a bit for every column of a tile that a splat reaches.
 
@@ -88,7 +82,7 @@ def blend_list(
             finished, total = blend(batch[entry - start], box, centers, state)
             if len(weights):
                 weights[lists[entry, 0]] = total
-            if finished and none_open(state[1]):
+            if finished and not state[1].any():
                 return
 
 
@@ -206,7 +200,7 @@ def blend_list_gradient(
         for entry in range(start, end):
             out = per_intersection[lists[entry, 0]]
             finished = blend_gradient(batch[entry - start], box, centers, grad, state, out)
-            if finished and none_open(state[2]):
+            if finished and not state[2].any():
                 return
 
 

@@ -87,23 +87,14 @@ class BlockLevel(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamJob:
-    """Description of the whole job, small enough to be sent to every process.
+    """Description of the whole job, small enough to be sent to every process."""
 
-    Attributes:
-        job: The input file, its blocks, and the folder of their files.
-        form: Format of the stream.
-        chunk_gaussians: Gaussians of the finest level in a chunk.
-        axes: Axes of the input file and of the output.
-        sh_degree: Highest SH degree to keep; None keeps all.
-        environment_radii: Robust radii beyond which Gaussians are the environment; None for none.
-    """
-
-    job: Job
+    job: Job  # the input file, its blocks, and the folder of their files
     form: StreamFormat
-    chunk_gaussians: int
-    axes: tuple[str, str]
-    sh_degree: int | None
-    environment_radii: float | None
+    chunk_gaussians: int  # of the finest level in a chunk
+    axes: tuple[str, str]  # of the input file and of the output
+    sh_degree: int | None  # the highest to keep; None keeps all
+    environment_radii: float | None  # beyond these, Gaussians are the environment; None for none
 
     @property
     def folder(self) -> Path:

@@ -56,32 +56,18 @@ class StreamLevel(NamedTuple):
 
 
 class StreamPart(Record):
-    """A written part of a scene; a part is the share that is in memory at once.
+    """A written part of a scene; a part is the share that is in memory at once."""
 
-    Attributes:
-        levels: Counts of each level, the finest first.
-        chunks: Number of chunks.
-        names: File names as in the index, in the order of its file numbers.
-        tree: The node of the index that holds the part.
-        box_min: Minimum coordinates of its chunks.
-        box_max: Maximum coordinates.
-        dropped: Data that its files do not hold, as :func:`cvtgs.io.limits.dropped_within`
-            returns them.
-        far: Number of Gaussians of each level that are in no chunk, the finest level first; empty
-            if there are none.
-        environments: Files with them by level, from the finest that can be the environment to the
-            coarsest, without empty ones.
-    """
-
-    levels: tuple[StreamLevel, ...]
+    levels: tuple[StreamLevel, ...]  # the finest first
     chunks: int
-    names: tuple[str, ...]
-    tree: dict[str, Any]
+    names: tuple[str, ...]  # of files as in the index, in the order of its file numbers
+    tree: dict[str, Any]  # the node of the index that holds the part
     box_min: Corner
     box_max: Corner
-    dropped: dict[str, int]
-    far: tuple[int, ...] = ()
+    dropped: dict[str, int]  # as :func:`cvtgs.io.limits.dropped_within` returns it
+    far: tuple[int, ...] = ()  # Gaussians of each level in no chunk; empty if there are none
     environments: dict[int, str] = pydantic.Field(default_factory=dict)
+    """Files with them by level, from the finest that can be the environment, without empty ones."""
 
 
 class StreamFormat(Protocol):

@@ -43,14 +43,9 @@ class _Unit(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SogFormat:
-    """Streamed SOG, as PlayCanvas' engine and SuperSplat's viewer load it.
+    """Streamed SOG, as PlayCanvas' engine and SuperSplat's viewer load it."""
 
-    Attributes:
-        file_gaussians: Maximum number of Gaussians in a SOG; a chunk is never split.
-        kind: Name of the format.
-    """
-
-    file_gaussians: int = FILE_GAUSSIANS
+    file_gaussians: int = FILE_GAUSSIANS  # the most in a SOG; a chunk is never split
     kind: str = "sog"
 
     def write_part(

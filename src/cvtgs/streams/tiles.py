@@ -59,17 +59,10 @@ class _Tile:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TilesFormat:
-    """3D Tiles 1.1, as CesiumJS loads them.
+    """3D Tiles 1.1, as CesiumJS loads them."""
 
-    Attributes:
-        tile_gaussians: Maximum number of Gaussians in a tile; a chunk is never split.
-        transform: Transform from the axes of the tileset (z up, metres) to its place, 16 numbers
-            column by column; None for no transform.
-        kind: Name of the format.
-    """
-
-    tile_gaussians: int = TILE_GAUSSIANS
-    transform: tuple[float, ...] | None = None
+    tile_gaussians: int = TILE_GAUSSIANS  # the most in a tile; a chunk is never split
+    transform: tuple[float, ...] | None = None  # from z up and metres, column by column
     kind: str = "3dtiles"
 
     def write_part(

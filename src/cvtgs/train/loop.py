@@ -203,13 +203,6 @@ class CaseGradient(NamedTuple):
     loss: float
     gradients: list[Tensor]
 
-    @property
-    def is_finite(self) -> bool:
-        """Whether the loss and all gradients are finite."""
-        return math.isfinite(self.loss) and all(
-            bool(one.isfinite().all()) for one in self.gradients
-        )
-
 
 @contextmanager
 def step_gradients(
@@ -286,7 +279,8 @@ def _step(
     ):
         parameter.grad = torch.stack(parts).mean(dim=0)
     for result in results:
-        if not result.is_finite:
+        finite = all(bool(gradient.isfinite().all()) for gradient in result.gradients)
+        if not (finite and math.isfinite(result.loss)):
             good = files.checkpoint if files.checkpoint.is_file() else "none yet"
             raise TrainingError(
                 f"the loss or its gradient is not finite at step {state.step}, {result.name}; "

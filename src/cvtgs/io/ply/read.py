@@ -292,27 +292,16 @@ def _explain(error: Any, elements: tuple[Element, ...], path: str) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlyRows:
-    """The rows of a binary little endian PLY file, read on demand.
-
-    Attributes:
-        path: The file.
-        count: Number of rows.
-        names: Names and numpy types of the columns.
-        layout: Names and PLY types of the columns, as a scene keeps them.
-        comments: Comment lines of the file.
-        offset: Where the first row starts, in bytes.
-        sh_degree: SH bands above this degree are left out of scenes; None keeps all.
-        axes: The axes of the file.
-    """
+    """The rows of a binary little endian PLY file, read on demand."""
 
     path: str
     count: int
-    names: tuple[tuple[str, str], ...]
-    layout: Layout
+    names: tuple[tuple[str, str], ...]  # names and numpy types of the columns
+    layout: Layout  # names and PLY types of the columns, as a scene keeps them
     comments: tuple[str, ...]
-    offset: int
-    sh_degree: int | None = None
-    axes: str = SCENE_AXES
+    offset: int  # where the first row starts, in bytes
+    sh_degree: int | None = None  # SH bands above it are left out of scenes; None keeps all
+    axes: str = SCENE_AXES  # of the file
 
     @property
     def dtype(self) -> np.dtype[Any]:
