@@ -11,12 +11,12 @@ import torch
 from safetensors.torch import save
 
 from cvtgs.errors import CheckpointError
+from cvtgs.io.tensors import tensors_digest
 from cvtgs.mergenet import (
     SHIPPED,
     Architecture,
     CheckpointInfo,
     MergeNet,
-    checkpoint,
     encode_checkpoint,
     load_checkpoint,
 )
@@ -325,6 +325,6 @@ def packed(weights: dict[str, torch.Tensor], told: str, *, version: str) -> byte
         "format": "cvtgs-mergenet",
         "format_version": version,
         "info": told,
-        "sha256": checkpoint._digest(weights, told),
+        "sha256": tensors_digest(weights, told),
     }
     return save(weights, metadata)

@@ -73,6 +73,8 @@ def test_arguments_of_another_kind_are_named(scenes, tmp_path):
         train({}, files)
     with pytest.raises(DeviceError, match="cudaa"):
         train(config_of(scenes), files, device="cudaa")
+    with pytest.raises(InvalidArgumentError, match="on_validation must be a function of a history"):
+        train(config_of(scenes), files, on_validation=3)
 
 
 @pytest.mark.slow
@@ -310,6 +312,7 @@ def test_without_matplotlib_there_is_a_network_and_no_image(scenes, cache, tmp_p
         raise MissingDependencyError("charts need matplotlib")
 
     monkeypatch.setattr(History, "curves", curves)
-    run(config_of(scenes), tmp_path / "net.safetensors", cache)
+    (tmp_path / "net.png").write_bytes(b"the curves of an earlier training")
+    run(config_of(scenes), tmp_path / "net.safetensors", cache, overwrite=True)
     assert (tmp_path / "net.safetensors").is_file()
     assert not (tmp_path / "net.png").exists()

@@ -160,6 +160,9 @@ def test_without_resume_a_training_starts_over(scenes, cache, tmp_path):
     with pytest.raises(PowerCutError):
         run(config_of(scenes), path, cache, listener=interrupting(5))
     before = path.read_bytes()
+    with pytest.raises(OutputExistsError, match=r"net\.state: there is a training to resume"):
+        run(config_of(scenes), path, cache)
+    path.with_suffix(".state").rename(tmp_path / "elsewhere")
     with pytest.raises(OutputExistsError, match=r"net\.safetensors: the output must not exist yet"):
         run(config_of(scenes), path, cache)
     assert path.read_bytes() == before

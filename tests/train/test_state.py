@@ -11,7 +11,7 @@ import torch
 import cvtgs
 from cvtgs.config import Section
 from cvtgs.errors import CheckpointError
-from cvtgs.io.tensors import map_tensors, save_tensors
+from cvtgs.io.tensors import map_tensors, save_tensors, tensors_digest
 from cvtgs.mergenet import (
     Architecture,
     CheckpointInfo,
@@ -185,7 +185,8 @@ def test_a_state_of_other_settings_is_of_another_version(tmp_path):
     facts = json.loads(metadata["state"])
     facts["config"].pop("keep")
     old = tmp_path / "old.state"
-    save_tensors(old, tensors, {"state": json.dumps(facts)})
+    text = json.dumps(facts)
+    save_tensors(old, tensors, {"state": text, "sha256": tensors_digest(tensors, text)})
     with pytest.raises(CheckpointError) as caught:
         loaded(old)
     assert str(caught.value) == (
@@ -198,16 +199,19 @@ SCENES = (LearnedScene(name="room", count=5, sha256="ab"), LearnedScene(name="ex
 
 
 @pytest.mark.parametrize(
-    "scenes",
+    ("scenes", "odd"),
     [
-        SCENES[:1],
-        (*SCENES[:1], SCENES[1].model_copy(update={"count": 8})),
-        SCENES[::-1],
-        (*SCENES[:1], SCENES[1].model_copy(update={"cameras_sha256": "cd"})),
+        (SCENES[:1], "exam"),
+        (SCENES[1:], "room"),
+        ((*SCENES, SCENES[1].model_copy(update={"name": "hall"})), "hall"),
+        ((*SCENES, SCENES[1]), "their number"),
+        ((*SCENES[:1], SCENES[1].model_copy(update={"count": 8})), "exam"),
+        (SCENES[::-1], "exam"),
+        ((*SCENES[:1], SCENES[1].model_copy(update={"cameras_sha256": "cd"})), "exam"),
     ],
-    ids=["fewer", "other", "other order", "other cameras"],
+    ids=["fewer", "without the first", "more", "twice", "other", "other order", "other cameras"],
 )
-def test_other_scenes_are_one_clear_error(tmp_path, scenes):
+def test_other_scenes_are_one_clear_error(tmp_path, scenes, odd):
     """Otherwise the checkpoint would name scenes that only the last steps saw."""
     path = tmp_path / "a.state"
     TrainState(small_net(), CONFIG, SCENES).save(path, CONFIG)
@@ -216,7 +220,7 @@ def test_other_scenes_are_one_clear_error(tmp_path, scenes):
         TrainState(small_net(), CONFIG, scenes).load(path, CONFIG)
     assert str(caught.value) == (
         f"{path}: the state belongs to a training run on other scenes, in another order or "
-        f"with other cameras (exam differs); restore these, or train to another output."
+        f"with other cameras ({odd} differs); restore these, or train to another output."
     )
 
 
@@ -235,7 +239,8 @@ def test_the_state_of_another_version_is_one_clear_error(tmp_path, monkeypatch):
 def damaged(path: Path, kind: str) -> None:
     content, (tensors, metadata) = path.read_bytes(), map_tensors(path)
     tensors = {name: values.clone() for name, values in tensors.items()}
-    facts = json.loads(metadata["state"])
+    text = metadata["state"]
+    facts = json.loads(text)
     path.unlink()
     if kind == "empty":
         path.write_bytes(b"")
@@ -243,21 +248,26 @@ def damaged(path: Path, kind: str) -> None:
         path.write_bytes(content[:-1])
     elif kind == "header":
         path.write_bytes(content[:9] + b"\xff" + content[10:])
+    elif kind == "a flipped bit":
+        path.write_bytes(content[:-101] + bytes([content[-101] ^ 64]) + content[-100:])
+    elif kind == "zeros":
+        zeros = {name: torch.zeros_like(values) for name, values in tensors.items()}
+        save_tensors(path, zeros, metadata)
     elif kind == "a network":
         save_tensors(path, tensors, {})
-    elif kind == "without weights":
-        tensors.pop(next(name for name in tensors if name.startswith("net/")))
-        save_tensors(path, tensors, metadata)
-    elif kind == "weights of another shape":
-        tensors["mean/decoder.bias"] = torch.zeros(7)
-        save_tensors(path, tensors, metadata)
-    elif kind == "without a step":
-        facts.pop("step")
-        save_tensors(path, tensors, {"state": json.dumps(facts)})
-    elif kind == "no facts":
-        save_tensors(path, tensors, {"state": "[]"})
-    elif kind == "facts cut short":
-        save_tensors(path, tensors, {"state": metadata["state"][:-5]})
+    else:
+        if kind == "without weights":
+            tensors.pop(next(name for name in tensors if name.startswith("net/")))
+        elif kind == "weights of another shape":
+            tensors["mean/decoder.bias"] = torch.zeros(7)
+        elif kind == "without a step":
+            facts.pop("step")
+            text = json.dumps(facts)
+        elif kind == "no facts":
+            text = "[]"
+        elif kind == "facts cut short":
+            text = text[:-5]
+        save_tensors(path, tensors, {"state": text, "sha256": tensors_digest(tensors, text)})
 
 
 @pytest.mark.parametrize(
@@ -266,6 +276,8 @@ def damaged(path: Path, kind: str) -> None:
         "empty",
         "cut short",
         "header",
+        "a flipped bit",
+        "zeros",
         "a network",
         "without weights",
         "weights of another shape",

@@ -1,12 +1,14 @@
 """Named tensors in safetensors files, which store networks and caches (never pickles)."""
 
 import errno
+import hashlib
 import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from cvtgs.errors import FileFormatError, InputNotFoundError
@@ -65,6 +67,16 @@ def map_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[s
         raise FileFormatError(
             f"{path}: the file is not a safetensors file, or it is damaged."
         ) from error
+
+
+def tensors_digest(tensors: Mapping[str, Tensor], text: str) -> str:
+    """Return the SHA-256 hash of tensors and of a text that belongs to them."""
+    digest = hashlib.sha256(f"{text}\n".encode())
+    for name in sorted(tensors):
+        values = tensors[name].detach().cpu()
+        digest.update(f"{name} {values.dtype} {tuple(values.shape)}\n".encode())
+        digest.update(values.contiguous().flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
 
 
 def add_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

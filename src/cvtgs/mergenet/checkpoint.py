@@ -1,6 +1,5 @@
 """Checkpoints: a MergeNet and a description of its training, in one safetensors file."""
 
-import hashlib
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from cvtgs.errors import (
     reason_of,
     warn,
 )
-from cvtgs.io.tensors import pack_tensors, unpack_tensors
+from cvtgs.io.tensors import pack_tensors, tensors_digest, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet, without_weights
 from cvtgs.mergenet.published import Net, PublishedArchitecture, PublishedMergeNet
 from cvtgs.text import printable, printable_name, short_repr, shown
@@ -138,7 +137,7 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
     content = _read(path, name)
     tensors, metadata = _unpack(content, name)
     info = _parse_info(metadata, name)
-    digest = _digest(tensors, metadata["info"])
+    digest = tensors_digest(tensors, metadata["info"])
     if metadata.get("sha256") != digest:
         raise CheckpointError(
             f"{name}: the checkpoint is damaged: its content must have the hash "
@@ -174,7 +173,7 @@ def encode_checkpoint(net: Net, info: CheckpointInfo) -> bytes:
     metadata = {
         "format": FORMAT,
         "format_version": str(FORMAT_VERSION),
-        "sha256": _digest(tensors, described),
+        "sha256": tensors_digest(tensors, described),
         "info": described,
     }
     return pack_tensors(tensors, metadata)
@@ -274,15 +273,6 @@ def _build_net(info: CheckpointInfo, tensors: dict[str, Tensor], name: str) -> N
         raise CheckpointError(f"{name}: the checkpoint holds weights that are not finite.")
     net.load_state_dict(tensors)
     return net.eval().requires_grad_(False)
-
-
-def _digest(tensors: Mapping[str, Tensor], described: str) -> str:
-    digest = hashlib.sha256(f"{described}\n".encode())
-    for name in sorted(tensors):
-        values = tensors[name]
-        digest.update(f"{name} {values.dtype} {tuple(values.shape)}\n".encode())
-        digest.update(values.contiguous().flatten().view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()
 
 
 def checkpoint_for(

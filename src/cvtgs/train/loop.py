@@ -1,6 +1,7 @@
 """The resumable training loop: gradients, steps, validations and output files."""
 
 import copy
+import errno
 import math
 import random
 from collections.abc import Callable, Iterator, Sequence
@@ -19,9 +20,11 @@ from cvtgs.devices import chosen_device, in_float32, on_host, thread_count, with
 from cvtgs.errors import (
     CheckpointError,
     ConfigError,
+    InvalidArgumentError,
     InvalidSceneError,
     MissingDependencyError,
     OutputError,
+    OutputExistsError,
     TrainingError,
     warn,
 )
@@ -40,7 +43,7 @@ from cvtgs.mergenet import (
 from cvtgs.mergenet.checkpoint import build_network
 from cvtgs.processes import LocalWorkers, can_start_processes
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.text import shortened
+from cvtgs.text import shortened, shown
 from cvtgs.train.cases import Case, DeviceCopies
 from cvtgs.train.config import TrainConfig
 from cvtgs.train.losses import local_loss, published_loss, scene_loss, validation_psnr
@@ -119,7 +122,18 @@ def train(
         [0, 2]
     """
     check_listener(listener)
-    resumes = resume and files.state.is_file()
+    if not callable(on_validation):
+        raise InvalidArgumentError(
+            f"on_validation must be a function of a history, found {shown(on_validation)}."
+        )
+    has_state = files.state.is_file()
+    resumes = resume and has_state
+    if has_state and not (resume or overwrite):
+        text = (
+            f"{files.state}: there is a training to resume, with resume=True (--resume), or to "
+            f"replace, with overwrite=True (--overwrite)."
+        )
+        raise OutputExistsError(text).about(files.state, errno.EEXIST)
     for path in (files.checkpoint, files.state, files.curves):
         check_output(path, overwrite=overwrite or resumes)
     sources = find_sources(config.data, seed=config.seed)
@@ -330,10 +344,10 @@ def _draw_curves(history: History, files: TrainFiles) -> None:
     """Write the image of the curves if that is possible: no training is lost for it."""
     try:
         curves = history.curves()
-    except MissingDependencyError:
-        return
     except Exception as error:  # of matplotlib: a backend that is not there, for example
-        warn(f"the curves are not drawn: {shortened(str(error), 200)}")
+        files.curves.unlink(missing_ok=True)  # it would show fewer steps, or another training
+        if not isinstance(error, MissingDependencyError):
+            warn(f"the curves are not drawn: {shortened(str(error), 200)}")
         return
     try:
         write_atomically(files.curves, curves, overwrite=True)

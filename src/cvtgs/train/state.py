@@ -5,7 +5,6 @@ import json
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path
 from statistics import mean
 from typing import Any, NamedTuple, Self
@@ -16,7 +15,7 @@ from torch import Tensor
 
 import cvtgs
 from cvtgs.errors import CheckpointError, OutputError
-from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
+from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, tensors_digest, under_prefix
 from cvtgs.mergenet import LearnedScene, MergeNet, Net, load_checkpoint
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.train.config import TrainConfig
@@ -251,7 +250,8 @@ class TrainState:
             "version": cvtgs.__version__,
             "scenes": [scene.model_dump() for scene in self.scenes],
         }
-        save_tensors(path, tensors, {"state": json.dumps(record)})
+        text = json.dumps(record)
+        save_tensors(path, tensors, {"state": text, "sha256": tensors_digest(tensors, text)})
 
     def load(self, path: Path, config: TrainConfig) -> None:
         """Read the state from a file that :meth:`save` wrote."""
@@ -265,6 +265,8 @@ class TrainState:
                 )
             self._check_settings(path, record["config"], config)
             self._check_scenes(path, record["scenes"])
+            if metadata["sha256"] != tensors_digest(tensors, metadata["state"]):
+                raise ValueError("the content has another hash")
             # Mapped tensors must not be written to, and the optimiser does not copy them: clone.
             self._load_tensors({name: values.clone() for name, values in tensors.items()})
             self.step = int(record["step"])
@@ -301,13 +303,16 @@ class TrainState:
     def _check_scenes(self, path: Path, scenes: list[dict[str, Any]]) -> None:
         """Raise an error for other scenes, or another order, in which steps draw them."""
         theirs = [LearnedScene.model_validate(scene) for scene in scenes]
-        pairs = zip_longest(self.scenes, theirs)
-        odd = [(ours or other).name for ours, other in pairs if ours != other]
-        if self.scenes and odd:
-            raise CheckpointError(
-                f"{path}: the state belongs to a training run on other scenes, in another order or "
-                f"with other cameras ({odd[0]} differs); restore these, or train to another output."
-            )
+        if not self.scenes or self.scenes == tuple(theirs):
+            return
+        missing = [one.name for one in theirs if one not in self.scenes]
+        new = [one.name for one in self.scenes if one not in theirs]
+        moved = [one.name for one, other in zip(self.scenes, theirs, strict=False) if one != other]
+        odd = [*missing, *new, *moved, "their number"]
+        raise CheckpointError(
+            f"{path}: the state belongs to a training run on other scenes, in another order or "
+            f"with other cameras ({odd[0]} differs); restore these, or train to another output."
+        )
 
     def _load_tensors(self, tensors: dict[str, Tensor]) -> None:
         self.net.load_state_dict(under_prefix("net/", tensors))
