@@ -54,7 +54,10 @@ def test_an_environment_is_mentioned_only_if_there_is_one(
         (["--stream", "sog", "--suffix", ".spz"], "--suffix cannot be used with --stream"),
         (["--stream", "sog", "--views", "4"], "--views cannot be used with --stream"),
         (["--chunk", "300"], "--chunk needs --stream."),
-        (["--stream", "3dtiles", "--environment", "9"], "and needs --stream sog; found 9."),
+        (
+            ["--stream", "3dtiles", "--environment", "9"],
+            "--environment needs --stream sog, found 3dtiles.",
+        ),
         (["--stream", "sog", "--environment", "-1"], "--environment must be above 0"),
         (["--stream", "sog", "--environment", "inf"], "--environment must be above 0"),
         (["--memory", "2GB"], "--memory needs --stream."),

@@ -1,5 +1,6 @@
 """``cvtgs tradeoff``: presets in separate processes, tables and files."""
 
+import csv
 import json
 from pathlib import Path
 
@@ -51,10 +52,18 @@ def test_a_failed_run_is_reported_and_the_others_continue(source, tmp_path, caps
 
     monkeypatch.setattr(measure, "run_process", fails_once)
     words = ["tradeoff", str(source), "--rho", "0.1", *LOOK, "-o", str(tmp_path / "out")]
-    assert main([*words, "--presets", "draft,fast", "--quiet"]) == 0
-    assert capsys.readouterr().err == "cvtgs: warning: draft 0.1 failed: the disk is full.\n"
+    assert main([*words, "--presets", "draft,fast", "--quiet"]) == 1
+    assert capsys.readouterr().err == (
+        "cvtgs: warning: draft 0.1 failed: the disk is full.\n"
+        f"cvtgs: error: 1 of 2 runs failed; {tmp_path / 'out'} has the others.\n"
+    )
     found = json.loads((tmp_path / "out" / "tradeoff.json").read_text())
-    assert found["failures"] == [{"name": "draft 0.1", "reason": "the disk is full."}]
+    (failure,) = found["failures"]
+    reason = "the disk is full."
+    assert failure == {"name": "draft 0.1", "preset": "draft", "rho": 0.1, "reason": reason}
+    lines = csv.DictReader((tmp_path / "out" / "tradeoff.csv").read_text().splitlines())
+    told = [(line["preset"], line["failure"], bool(line["psnr"])) for line in lines]
+    assert told == [("fast", "", True), ("draft", reason, False)]
     assert main([*words, "--presets", "draft", "--overwrite"]) == 1
     error = "cvtgs: error: every run failed; draft 0.1: the disk is full.\n"
     assert capsys.readouterr().err == error

@@ -54,3 +54,12 @@ def test_a_file_is_scored_as_the_command_does(scene, small, tmp_path, capsys):
 def test_photographs_need_their_cameras(scene, small):
     with pytest.raises(InvalidArgumentError, match="photographs need the cameras that took them"):
         evaluate(scene, small, photographs=torch.zeros(8, 480, 640, 3), settings=OFF)
+
+
+def test_gaussians_that_are_not_drawn_are_told(scene, small):
+    means = scene.means.clone()
+    means[:3] = torch.nan
+    broken = scene.with_tensors(means=means)
+    with pytest.warns(UserWarning, match="^full has 3 Gaussians with NaN, infinite or zero values"):
+        found = evaluate(broken, small, settings=OFF)
+    assert found.reference_count == 2000

@@ -160,7 +160,9 @@ def test_repeated_warnings_of_processes_are_issued_once():
 
 
 def test_the_page_escapes_texts_and_names_failures():
-    made = tradeoff(*MADE, failures=(Failure(name="max 0.1", reason="a < b."),))
+    made = tradeoff(
+        *MADE, failures=(Failure(name="max 0.1", preset="max", rho=0.1, reason="a < b."),)
+    )
     html = page_summary(made, None)
     assert "<img" not in html
     assert "max 0.1 failed: a &lt; b." in html
@@ -215,8 +217,10 @@ def test_files_are_written_completely_and_replaced_only_when_asked(measured, tmp
 def test_without_matplotlib_only_the_plot_is_missing(measured, tmp_path, monkeypatch):
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)
-    paths, note = write_tradeoff(measured, tmp_path)
+    (tmp_path / "tradeoff.png").write_bytes(b"of an earlier run")
+    paths, note = write_tradeoff(measured, tmp_path, overwrite=True)
     assert [path.name for path in paths] == ["tradeoff.csv", "tradeoff.json", "index.html"]
+    assert not (tmp_path / "tradeoff.png").exists()
     assert 'pip install "cvtgs[plots]"' in note
 
 

@@ -22,7 +22,7 @@ from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped, shortf
 from cvtgs.cli.jobs import expanded
 from cvtgs.cli.options import CAMERA_FILES, AddParser, add_options, read_words
 from cvtgs.cli.view import PAGE, check_page, write_page
-from cvtgs.errors import InvalidArgumentError, warn
+from cvtgs.errors import InvalidArgumentError, RunError, warn
 from cvtgs.io.atomic import windows_fault, write_atomically
 from cvtgs.progress import ProgressEvent
 from cvtgs.text import MOST_LETTERS, counted, printable_name, size_text
@@ -314,6 +314,10 @@ def tradeoff(options: argparse.Namespace) -> None:
         say(f"Wrote {names}. Open {paths[-1]} in a browser.")
         if note:
             say(f"No plot was written: {note}")
+    failed = len(measured.tradeoff.failures)
+    if failed:
+        runs = counted(failed + len(measured.tradeoff.results), "run")
+        raise RunError(f"{failed} of {runs} failed; {options.output} has the others.")
 
 
 def _print_tradeoff(tradeoff: "Tradeoff") -> None:

@@ -95,10 +95,10 @@ def check_stream_options(options: argparse.Namespace) -> None:
     if options.chunk is not None and options.chunk < 1:
         raise InvalidArgumentError(f"--chunk must be at least 1, found {options.chunk}.")
     far = options.environment
-    if far is not None and not (options.stream == "sog" and 0 < far < math.inf):
-        raise InvalidArgumentError(
-            f"--environment must be above 0, and needs --stream sog; found {far:g}."
-        )
+    if far is not None and options.stream != "sog":
+        raise InvalidArgumentError(f"--environment needs --stream sog, found {options.stream}.")
+    if far is not None and not 0 < far < math.inf:
+        raise InvalidArgumentError(f"--environment must be above 0, found {far:g}.")
     read_transform(options)
     make_folder(options.output.parent)
     check_stream(options.output, options.stream, overwrite=options.overwrite)

@@ -30,6 +30,7 @@ from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.rendering import choose_backend
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.text import printable_name, short_repr, shown
+from cvtgs.validity import valid_rows
 from cvtgs.views import automatic_views, find_own_cameras
 
 STAGE = "evaluate"  # stage name in progress events; one step per image
@@ -319,6 +320,12 @@ def _score_images(
     """Score all scenes against the first, view by view; pass every image to ``keep``."""
     check_listener(listener)
     (reference_name, reference), *_ = scenes.items()
+    for name, scene in scenes.items():
+        if invalid := len(scene) - int(valid_rows(scene).sum()):
+            warn(
+                f"{name} has {invalid:,} Gaussians with NaN, infinite or zero values, of "
+                f"{len(scene):,}; they are not drawn."
+            )
     metrics = _checked_metrics(reference, cameras, photographs, settings, name=reference_name)
     against_full: dict[str, list[ImageScores]] = {name: [] for name in scenes}
     against_photographs: dict[str, list[ImageScores]] = {name: [] for name in scenes}

@@ -87,7 +87,7 @@ def write_tradeoff(
 ) -> Written:
     """Write ``tradeoff.csv``, ``.json``, ``.png`` and ``index.html``, each atomically.
 
-    Without matplotlib there is no plot.
+    Without matplotlib there is no plot, and one of an earlier run is removed.
 
     Args:
         measured: The measurements.
@@ -122,6 +122,8 @@ def write_tradeoff(
         PAGE: page.encode(),
     }
     kept = {Path(folder) / name: content for name, content in contents.items() if content}
+    if chart is None:
+        (Path(folder) / PLOT).unlink(missing_ok=True)  # of other results
     for done, (path, content) in enumerate(kept.items(), start=1):
         write_atomically(path, content, overwrite=overwrite)
         listener(ProgressEvent(stage=STAGE, done=done, total=len(kept)))
@@ -129,11 +131,20 @@ def write_tradeoff(
 
 
 def tradeoff_chart(tradeoff: Tradeoff) -> bytes:
-    """Plot PSNR and SSIM over seconds, with a line per ratio through the runs on the front."""
+    """Plot PSNR and SSIM over seconds, with a line per ratio through the runs on the front.
+
+    A PSNR that is infinite, of equal images, is left out, and the title says so.
+    """
     seconds = [result.seconds for result in tradeoff.results]
+    endless = sum(math.isinf(result.psnr) for result in tradeoff.results)
+    only = f", rho {written(tradeoff.rhos[0])}" if len(tradeoff.rhos) == 1 else ""
     panels = []
     for metric in ("psnr", "ssim"):
-        series = []
+        title, series = f"{metric.upper()}{only}", []
+        if metric == "psnr" and endless:
+            title += f" (infinite for {counted(endless, 'run')}, not shown)"
+        if metric == "psnr" and endless == len(seconds):
+            continue
         for rho in tradeoff.rhos:
             results = [result for result in tradeoff.results if result.rho == rho]
             results.sort(key=lambda result: result.seconds)
@@ -150,7 +161,7 @@ def tradeoff_chart(tradeoff: Tradeoff) -> bytes:
         panels.append(
             Panel(
                 series=series,
-                title=metric.upper(),
+                title=title,
                 x_label="seconds of the whole process",
                 y_label="PSNR, dB" if metric == "psnr" else "SSIM",
                 x_ticks=ticks(min(seconds), max(seconds)),

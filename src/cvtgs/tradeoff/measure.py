@@ -253,7 +253,10 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
                     trust_sizes=trust_sizes,
                 )
             except RunError as error:
-                failures.append(Failure(name=task.name, reason=str(error)))
+                reason = str(error) if kept else str(error).replace(f"{place}{os.sep}", "")
+                failures.append(
+                    Failure(name=task.name, preset=task.preset, rho=task.rho, reason=reason)
+                )
             else:
                 runs.append(run)
                 pass_warnings_on(run.cost.errors, warned)

@@ -57,10 +57,14 @@ class Failure(Record):
 
     Attributes:
         name: Preset and ratio.
+        preset: Name of the preset.
+        rho: Requested ratio.
         reason: Why it failed, one sentence.
     """
 
     name: str
+    preset: str
+    rho: float
     reason: str
 
 
@@ -119,12 +123,16 @@ class Tradeoff(Record):
         return max(0.0, result.seconds - self.start_seconds - sum(result.stage_seconds.values()))
 
     def to_csv(self) -> str:
-        """Return one line per run, with seconds per stage.
+        """Return one line per run, with seconds per stage; failed runs come last.
 
         Returns:
             Comma-separated values with a header line; values not measured are empty.
         """
         rows = [self._row(result) for result in self.results]
+        rows += [
+            {"preset": failure.preset, "rho": failure.rho, "failure": failure.reason}
+            for failure in self.failures
+        ]
         file = io.StringIO()
         writer = csv.DictWriter(file, list(rows[0]) if rows else ["preset"], lineterminator="\n")
         writer.writeheader()
@@ -139,6 +147,7 @@ class Tradeoff(Record):
             "start_seconds": self.start_seconds,
             **seconds,
             "read_write_seconds": self.rest_seconds(result),
+            "failure": "",
         }
 
 

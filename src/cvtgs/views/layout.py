@@ -304,9 +304,8 @@ def viewable_part(scene: GaussianScene) -> GaussianScene:
     """Return the valid rows of a scene that has some."""
     part = valid_part(scene)
     if len(part) == 0:
-        raise InvalidSceneError(
-            f"automatic views need a scene with valid Gaussians; none of {len(scene):,} is valid."
-        )
+        found = f"none of {len(scene):,} is valid" if len(scene) else "found none"
+        raise InvalidSceneError(f"automatic views need a scene with valid Gaussians; {found}.")
     return part
 
 
