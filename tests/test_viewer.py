@@ -145,14 +145,22 @@ def test_too_little_memory_is_an_error_on_the_page(
     until(lambda: control(page, FACTS).content.startswith("5 of 500 Gaussians"))
 
 
+def score_view(page: Any, **odd: Any) -> None:
+    """Ask for the PSNR of a view, as a visitor of the page does."""
+    seen = {"wxyz": (1, 0, 0, 0), "position": (0, 0, -4), "fov": 0.8}
+    camera = SimpleNamespace(**seen | {"image_width": 150, "image_height": 100} | odd)
+    control(page, "PSNR of this view").call(SimpleNamespace(camera=camera))
+
+
 @pytest.mark.slow
 def test_the_current_view_is_scored(page: Any) -> None:
-    camera = SimpleNamespace(wxyz=(1, 0, 0, 0), position=(0, 0, -4), fov=0.8, aspect=1.5)
-    control(page, "PSNR of this view").call(SimpleNamespace(camera=camera))
+    score_view(page)
     assert notes(page).startswith("simplified: ")
     view = camera_of((1, 0, 0, 0), (0, 0, -4), fov=0.8, aspect=1.5)
     assert f"{page.viewer.score('simplified', view):.2f} dB" in notes(page)
     assert page.viewer.score("full scene", view) > 60
+    score_view(page, position=(0, 0, 1e9))
+    assert notes(page) == "**this view shows nothing of the full scene.**"
 
 
 @pytest.mark.slow
@@ -235,9 +243,10 @@ def test_images_of_a_view_are_small_whatever_the_window(
 @pytest.mark.parametrize(
     "odd",
     [
-        {"aspect": 0.0},
-        {"aspect": math.nan},
-        {"aspect": math.inf},
+        {"image_width": 0},
+        {"image_height": 0},
+        {"image_width": math.nan},
+        {"image_width": math.inf},
         {"fov": 0.0},
         {"fov": math.pi},
         {"wxyz": (0, 0, 0, 0)},
@@ -245,9 +254,9 @@ def test_images_of_a_view_are_small_whatever_the_window(
     ],
 )
 def test_a_view_that_shows_nothing_is_an_error_on_the_page(page: Any, odd: dict[str, Any]) -> None:
-    seen = {"wxyz": (1, 0, 0, 0), "position": (0, 0, -4), "fov": 0.8, "aspect": 1.5} | odd
-    control(page, "PSNR of this view").call(SimpleNamespace(camera=SimpleNamespace(**seen)))
+    score_view(page, **odd)
     assert notes(page).startswith("**a view must have a size, a direction and a field of view")
+    assert "np." not in notes(page)
 
 
 def test_a_scene_that_is_not_there_yet_is_an_error(scene: GaussianScene, tmp_path: Path) -> None:

@@ -8,11 +8,12 @@ from typing import NamedTuple
 import torch
 
 from cvtgs.cameras import Cameras
-from cvtgs.errors import InvalidArgumentError, OutputError
+from cvtgs.errors import InvalidArgumentError, OutputError, RunError
 from cvtgs.evaluation.metrics import psnr
 from cvtgs.io import save
 from cvtgs.math.parameters import rotation_matrices
 from cvtgs.prepared import Prepared
+from cvtgs.progress import ProgressEvent
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
 from cvtgs.simplifier import Simplifier
@@ -69,7 +70,7 @@ class SceneViewer:
             raise InvalidArgumentError(
                 f"scenes other than the full one must not be named {taken.pop()!r}; rename it."
             )
-        self._scene, self._device = scene, device
+        self._scene, self._device, self._is_stopped = scene, device, False
         self._prepared: dict[str, Prepared] = {}
         self.scenes = {FULL: ShownScene(scene, _counted(scene, scene))}
         for name, other in (others or {}).items():
@@ -88,14 +89,24 @@ class SceneViewer:
         Raises:
             InvalidArgumentError: The ratio is out of range.
             ConfigError: The preset does not exist.
+            RunError: The viewer was stopped.
         """
         if preset not in self._prepared:
-            simplifier = Simplifier(preset=preset, device=self._device)
+            simplifier = Simplifier(preset=preset, device=self._device, listener=self._go_on)
             self._prepared[preset] = simplifier.prepare(self._scene)
         small, report = self._prepared[preset].run(rho)
         facts = f"{_counted(small, self._scene)}, {report.seconds:.2f} s with {preset}"
         self.scenes[SIMPLIFIED] = ShownScene(small, facts)
         return self.scenes[SIMPLIFIED]
+
+    def stop(self) -> None:
+        """End a running simplification at its next stage or step, with an error, and later ones."""
+        self._is_stopped = True
+
+    def _go_on(self, event: ProgressEvent) -> None:
+        """Raise if the viewer was stopped."""
+        if self._is_stopped:
+            raise RunError(f"the viewer was stopped during {event.stage}.")
 
     def warm_up(self, preset: str) -> None:
         """Compute the data that all sizes share, so that the first slider move is not slower.
@@ -117,13 +128,13 @@ class SceneViewer:
             The mean over the cameras; infinite for the full scene itself.
 
         Raises:
-            InvalidArgumentError: There is no such scene, or not yet.
+            InvalidArgumentError: There is no such scene, or not yet, or no camera sees anything of
+                the full one.
         """
-        images = [
-            render(valid_part(one), cameras).rgb.clamp(0, 1)
-            for one in (self._named(name), self._scene)
-        ]
-        return float(psnr(*images).mean())
+        small, full = (render(valid_part(one), cameras) for one in (self._named(name), self._scene))
+        if float(full.alpha.amax()) == 0.0:
+            raise InvalidArgumentError("this view shows nothing of the full scene.")
+        return float(psnr(small.rgb.clamp(0, 1), full.rgb.clamp(0, 1)).mean())
 
     def save(self, name: str, path: str | os.PathLike[str]) -> str:
         """Write a scene to a new file.

@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -225,8 +226,9 @@ class ViewerServer:
         for name, one in viewer.scenes.items():
             self._draw(name, one.scene)
         self._wanted.set()
-        self._worker = threading.Thread(target=self._work, daemon=True)
-        self._worker.start()
+        # Ctrl+C in Thread.join takes a running thread for an ended one (Python before 3.13).
+        self._ended = threading.Event()
+        threading.Thread(target=self._work, daemon=True).start()
 
     def page(self) -> str:
         """Return a standalone page with the current scenes; its time line flips between them.
@@ -248,8 +250,8 @@ class ViewerServer:
 
     def wait(self) -> None:
         """Serve until the process is interrupted or the server is closed."""
-        while not self._closed:
-            self._worker.join(timeout=_GIVE_UP)
+        while not self._ended.wait(timeout=_GIVE_UP):
+            pass
 
     def finish(self) -> None:
         """Wait until the first simplified scene is shown.
@@ -262,13 +264,21 @@ class ViewerServer:
             raise self._error
 
     def close(self) -> None:
-        """Stop the server."""
+        """Stop the server, and a simplification at its next stage or step."""
         self._closed = True
+        self._viewer.stop()
         self._wanted.set()
-        self._worker.join()
+        self._ended.wait()
         stop_server(self._server)
 
     def _work(self) -> None:
+        """Work until the server is closed."""
+        try:
+            self._work_until_closed()
+        finally:
+            self._ended.set()
+
+    def _work_until_closed(self) -> None:
         """Simplify for the latest position of the slider; skip positions in between."""
         while not self._closed:
             self._wanted.wait()
@@ -290,8 +300,12 @@ class ViewerServer:
     def _simplify(self) -> str:
         slider = self._slider  # another program may send any value
         rho = self._start or 10.0 ** min(slider.max, max(slider.min, slider.value))
-        self._facts.content = f"simplifying to {rho:.4g} ..."
-        small = self._viewer.simplify(self._preset.value, rho)
+        before, self._facts.content = self._facts.content, f"simplifying to {rho:.4g} ..."
+        try:
+            small = self._viewer.simplify(self._preset.value, rho)
+        except Exception:
+            self._facts.content = before
+            raise
         self._draw(SIMPLIFIED, small.scene)
         self._show()
         return ""
@@ -317,16 +331,18 @@ class ViewerServer:
             self._try(lambda: self._score_view(camera))
 
     def _score_view(self, camera: "viser.CameraHandle") -> str:
-        cameras = camera_of(
-            tuple(camera.wxyz), tuple(camera.position), fov=camera.fov, aspect=camera.aspect
-        )
+        rotation, position = (tuple(map(float, x)) for x in (camera.wxyz, camera.position))
+        height = camera.image_height  # 0 in a window without height, where viser's aspect fails
+        aspect = camera.image_width / height if height else 0.0
+        cameras = camera_of(rotation, position, fov=camera.fov, aspect=aspect)
         name = self._shown.value
         return f"{name}: {self._viewer.score(name, cameras):.2f} dB in this view"
 
     def _save(self) -> str:
         """Save the shown scene; with ``host``, others than the user of this machine may do so."""
         name = self._path.value.strip()
-        if name and not is_within(name):
+        is_below = Path(name).resolve().is_relative_to(Path.cwd().resolve())  # links followed
+        if name and not (is_within(name) and is_below):
             raise OutputError(
                 f"{name}: a scene is saved in the folder where the program was started, or below."
             )
