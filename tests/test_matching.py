@@ -195,8 +195,8 @@ def test_only_held_out_images_decide_on_opacities(monkeypatch):
 
     monkeypatch.setattr("cvtgs.matching.mean_squared_error", noted)
     config = MatchConfig(opacity_rounds=1, color_iterations=1)
-    match_views(scene, views, views.contributions, config=config)
-    assert len(judged) == 3
+    report = match_views(scene, views, views.contributions, config=config).report
+    assert (len(judged), report.views, report.heldout) == (3, 16, 2)
     assert all(torch.equal(centers, ring(16).centers[[4, 12]]) for centers in judged)
 
 

@@ -298,6 +298,7 @@ def match_views(
     after = before if colored is small else mean_squared_error(colored, deciding)
     report = MatchReport(
         views=len(views.cameras),
+        heldout=len(deciding.cameras),
         opacities_kept=helps,
         psnr_before=psnr_from_error(before),
         psnr_after=psnr_from_error(after),

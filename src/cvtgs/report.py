@@ -58,14 +58,17 @@ class MatchReport(Record):
 
     Attributes:
         views: Number of images of the full scene.
+        heldout: Number of those that decided and score: every eighth, or all if there are fewer
+            than eight. Blocks have their own images.
         opacities_kept: Whether the matched opacities were kept, because they lowered the error of
-            the held-out images: every eighth image, or all if there are fewer than eight.
+            the held-out images.
         psnr_before: PSNR of the mean squared error of the held-out images before matching, dB.
         psnr_after: The same after matching.
         backend: Name of the renderer.
     """
 
     views: int
+    heldout: int
     opacities_kept: bool
     psnr_before: float
     psnr_after: float

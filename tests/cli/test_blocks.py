@@ -8,8 +8,10 @@ import pytest
 import cvtgs
 from cvtgs.cli.blocks import block_workers
 from cvtgs.cli.main import main
+from cvtgs.cli.simplify import block_memory
 from cvtgs.errors import OutputBusyError, OutputError, RunError
-from cvtgs.outofcore.memory import WORKER_BYTES
+from cvtgs.io.ply import PlyRows
+from cvtgs.outofcore.memory import IMAGE_BYTES, WORKER_BYTES
 from scenes import random_scene
 
 
@@ -89,3 +91,29 @@ def test_blocks_refuse_another_device(
     assert main(given) == 1
     error = "cvtgs: error: --device cuda cannot be used with blocks, which are computed on the CPU."
     assert capsys.readouterr().err.strip() == error
+
+
+def test_images_leave_less_memory_for_one_piece(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rooms: list[int] = []
+
+    def count(rows: PlyRows, memory: int, *, merging: int) -> int:
+        rooms.append(memory)
+        return 1
+
+    monkeypatch.setattr("cvtgs.outofcore.memory.block_count", count)
+    cvtgs.save(random_scene(300), tmp_path / "in.ply")
+    options = argparse.Namespace(
+        input=tmp_path / "in.ply",
+        rho=0.1,
+        count=None,
+        max_count=None,
+        memory="2GB",
+        workers=1,
+        scheduler=None,
+        device="auto",
+    )
+    for preset in ("standard", "matched"):
+        assert block_memory(options, cvtgs.SimplifyConfig(preset=preset)) is None
+    assert rooms == [2_000_000_000, 2_000_000_000 - IMAGE_BYTES]

@@ -108,24 +108,23 @@ def test_a_target_out_of_reach_of_the_format_says_so(capsys, source):
 
 
 @pytest.mark.parametrize(
-    ("views", "blocks", "where"),
-    [
-        (4, 1, "the same images"),
-        (8, 1, "every eighth of them"),
-        (12, 3, "the same images"),
-        (24, 3, "every eighth of them"),
-    ],
+    ("views", "heldout", "where"),
+    [(4, 4, "the same images"), (32, 4, "4 of them, which are held out")],
 )
-def test_the_images_that_a_matching_is_scored_on_are_named(views, blocks, where):
+def test_the_images_that_a_matching_is_scored_on_are_named(views, heldout, where):
     matched = MatchReport(
-        views=views, opacities_kept=True, psnr_before=20.0, psnr_after=20.5, backend="numba"
+        views=views,
+        heldout=heldout,
+        opacities_kept=True,
+        psnr_before=20.0,
+        psnr_after=20.5,
+        backend="numba",
     )
     report = SimplifyReport(
         input_count=10,
         output_count=1,
         target_count=1,
         rho=0.1,
-        blocks=blocks,
         matching=matched,
         config=cvtgs.SimplifyConfig(),
     )

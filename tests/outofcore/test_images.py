@@ -171,9 +171,15 @@ def test_only_views_that_a_refinement_uses_are_searched(settings, views):
 
 def test_reports_of_matched_blocks_are_joined():
     shared = {"backend": "numba"}
-    one = MatchReport(views=3, opacities_kept=True, psnr_before=20.0, psnr_after=23.0, **shared)
-    two = MatchReport(views=5, opacities_kept=False, psnr_before=24.0, psnr_after=30.0, **shared)
-    wanted = MatchReport(views=8, opacities_kept=False, psnr_before=22.0, psnr_after=26.5, **shared)
+    one = MatchReport(
+        views=3, heldout=3, opacities_kept=True, psnr_before=20.0, psnr_after=23.0, **shared
+    )
+    two = MatchReport(
+        views=9, heldout=1, opacities_kept=False, psnr_before=24.0, psnr_after=30.0, **shared
+    )
+    wanted = MatchReport(
+        views=12, heldout=4, opacities_kept=False, psnr_before=22.0, psnr_after=26.5, **shared
+    )
     assert module.join_matchings([one, two]) == wanted
 
 

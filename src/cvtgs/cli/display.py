@@ -135,11 +135,10 @@ def report_notes(report: "SimplifyReport") -> list[str]:
     if report.config.uses_images and report.views == "none":
         notes.append("No images were rendered, since no Gaussians had to merge.")
     if report.matching is not None:
-        from cvtgs.matching import heldout_rows
-
         matched = report.matching
-        each = matched.views // report.blocks  # every block has held-out images of its own
-        where = "every eighth of them" if heldout_rows(each) else "the same images"
+        where = f"{matched.heldout} of them, which are held out"
+        if matched.heldout == matched.views:
+            where = "the same images"
         notes.append(
             f"Matched to {counted(matched.views, 'image')} of the scene: "
             f"{matched.psnr_after - matched.psnr_before:+.2f} dB on {where}."

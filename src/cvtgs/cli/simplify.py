@@ -338,8 +338,10 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
 def _needs_blocks(options: argparse.Namespace, memory: int, config: "SimplifyConfig") -> bool:
     """Return whether a file does not fit; only binary PLYs can be read in parts, and simplified."""
     from cvtgs.grouping import finer_count
-    from cvtgs.outofcore.memory import block_count
+    from cvtgs.outofcore.memory import IMAGE_BYTES, block_count
 
+    if config.uses_images:
+        memory -= IMAGE_BYTES
     rows = _rows_of(options.input)
     if rows is None:
         return False

@@ -326,6 +326,7 @@ def join_matchings(reports: Sequence[MatchReport]) -> MatchReport:
     """Combine the reports of all blocks: sums of views, means of PSNR."""
     return MatchReport(
         views=sum(report.views for report in reports),
+        heldout=sum(report.heldout for report in reports),
         opacities_kept=all(report.opacities_kept for report in reports),
         psnr_before=mean(report.psnr_before for report in reports),
         psnr_after=mean(report.psnr_after for report in reports),

@@ -31,7 +31,7 @@ from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, wr
 SENT_BYTES = "sent_bytes"  # entry of the label file of a block: bytes of the file of its sent rows
 
 
-FILES_VERSION = 9
+FILES_VERSION = 10
 """Number of the layout of these files: raise it with every change, so that no run continues with
 files of another layout."""
 

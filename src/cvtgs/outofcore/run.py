@@ -17,7 +17,7 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.counts import checked_whole, shared_out, shortfall, target_count, whole_number
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
 from cvtgs.edit import concatenate
-from cvtgs.errors import ConfigError, check_path
+from cvtgs.errors import ConfigError, check_path, warn
 from cvtgs.evaluation.blind_views import check_seen
 from cvtgs.grouping import finer_count, most_cells
 from cvtgs.io import atomic_output, check_save, load, save
@@ -26,6 +26,7 @@ from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import join_plys, open_rows
 from cvtgs.outofcore.allocate import allocate, join
 from cvtgs.outofcore.images import (
+    LEAST_CAMERAS,
     add_contributions,
     improve,
     join_matchings,
@@ -347,6 +348,13 @@ def report_blocks(
     """Add up the reports of all blocks."""
     scan, with_cells = job.read_scan(), job.blocks_with_cells()
     reports = [read_report(job, block) for block in with_cells]
+    if job.cameras is not None and (job.config.match.enabled or job.config.refine.enabled):
+        left = sum(report.matching is None and report.refinement is None for report in reports)
+        if left:
+            warn(
+                f"{left} of {len(reports)} blocks are shown by fewer than {LEAST_CAMERAS} cameras, "
+                f"so they were not matched to images or refined."
+            )
     matchings = [report.matching for report in reports if report.matching is not None]
     refinements = [report.refinement for report in reports if report.refinement is not None]
     total, valid = job.source.count, scan.row_count + scan.kept_count
