@@ -181,12 +181,12 @@ def _call(work: bytes) -> bytes:
 def _begin(watched: Connection, threads: int) -> None:
     """Prepare a worker process: it leaves Ctrl-C to its parent, and ends when the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(watched,), daemon=True).start()
     os.environ["OMP_NUM_THREADS"] = str(threads)  # for searches and for libraries loaded later
     load_torch()
     import torch  # noqa: PLC0415 (with these settings)
 
     torch.set_num_threads(threads)  # the program of the parent may have loaded it
-    threading.Thread(target=_end_with, args=(watched,), daemon=True).start()
 
 
 def _end_with(watched: Connection) -> None:
