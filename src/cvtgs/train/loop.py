@@ -5,7 +5,7 @@ import errno
 import math
 import random
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
@@ -345,7 +345,8 @@ def _draw_curves(history: History, files: TrainFiles) -> None:
     try:
         curves = history.curves()
     except Exception as error:  # of matplotlib: a backend that is not there, for example
-        files.curves.unlink(missing_ok=True)  # it would show fewer steps, or another training
+        with suppress(OSError):  # it would show fewer steps, or another training
+            files.curves.unlink()
         if not isinstance(error, MissingDependencyError):
             warn(f"the curves are not drawn: {shortened(str(error), 200)}")
         return
