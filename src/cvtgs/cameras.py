@@ -296,8 +296,9 @@ class Cameras:
         Raises:
             InvalidArgumentError: ``points`` is no tensor of floats of this shape.
         """
-        for view, intrinsics in zip(self.viewmats.to(points), self.Ks.to(points), strict=True):
-            x, y, depth = intrinsics @ (view[:3, :3] @ points.T + view[:3, 3:])
+        scales = view_scales(self.viewmats).to(points)[:, None, None]
+        for view, matrix in zip(self.viewmats.to(points) / scales, self.Ks.to(points), strict=True):
+            x, y, depth = matrix @ (view[:3, :3] @ points.T + view[:3, 3:])
             inside = (depth >= NEAR_PLANE) & (x >= 0) & (x <= self.width * depth)
             if bool((inside & (y >= 0) & (y <= self.height * depth)).any()):
                 return True
@@ -393,8 +394,7 @@ def look_at(
     upright = torch.where(parallel, other, upright)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, upright), dim=1)
     down = torch.linalg.cross(forward, right)
-    rotations = torch.stack([right, down, forward], dim=1)
     viewmats = torch.eye(4, dtype=eyes.dtype, device=eyes.device).repeat(len(eyes), 1, 1)
-    viewmats[:, :3, :3] = rotations
-    viewmats[:, :3, 3] = -(rotations @ eyes[:, :, None])[:, :, 0]
+    viewmats[:, :3, :3] = torch.stack([right, down, forward], dim=1)
+    viewmats[:, :3, 3] = -(viewmats[:, :3, :3] @ eyes[:, :, None])[:, :, 0]
     return viewmats

@@ -100,3 +100,27 @@ def test_upright_photographs_may_have_pixels_that_are_not_quite_square(tmp_path)
     (tmp_path / "b.png").write_bytes(encode(np.zeros((1600, 1100, 3), np.uint8), "png"))
     with pytest.raises(InvalidArgumentError, match="found 1100 x 1600"):
         fit_cameras(cameras, tmp_path)
+
+
+def test_a_photograph_lies_in_the_folder_by_any_last_parts_of_its_name(tmp_path):
+    """As of a rig whose names begin with a folder that was scaled: images/left/1.png."""
+    rig = cvtgs.Cameras(
+        viewmats=torch.eye(4).expand(2, 4, 4),
+        Ks=torch.eye(3).expand(2, 3, 3),
+        width=8,
+        height=8,
+        names=("images/left/1.png", "images/right/1.png"),
+    )
+    for value, side in ((50, "left"), (100, "right")):
+        (tmp_path / "images_4" / side).mkdir(parents=True)
+        content = encode(np.full((8, 8, 3), value, np.uint8), "png")
+        (tmp_path / "images_4" / side / "1.png").write_bytes(content)
+    found = load_photographs(tmp_path / "images_4", rig)
+    assert (found[:, 0, 0, 0] * 255).round().tolist() == [50, 100]
+
+
+def test_an_image_of_too_many_pixels_is_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr("PIL.Image.MAX_IMAGE_PIXELS", 20)
+    (tmp_path / "a.png").write_bytes(encode(np.zeros((8, 8, 3), np.uint8), "png"))
+    with pytest.raises(FileFormatError, match=r"a\.png: must have fewer pixels; Image size \(64"):
+        read_image(tmp_path / "a.png", (8, 8), (0.0, 0.0, 0.0))

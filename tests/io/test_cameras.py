@@ -147,6 +147,15 @@ def test_blender_scenes_have_one_file_per_split_and_png_sizes(tmp_path) -> None:
     )
 
 
+def test_paths_of_windows_lead_to_the_sizes_of_images(tmp_path) -> None:
+    (frame,) = transforms(rows=[0])["frames"]
+    frame = {"file_path": ".\\train\\r_0", "transform_matrix": frame["transform_matrix"]}
+    write_json(tmp_path / "transforms.json", {"camera_angle_x": 1.0, "frames": [frame]})
+    (tmp_path / "train").mkdir()
+    png(tmp_path / "train" / "r_0.png", 48, 32)
+    assert load_cameras(tmp_path).width == 48
+
+
 def png(path: Path, width: int, height: int) -> None:
     header = struct.pack(">I4sIIBBBBB", 13, b"IHDR", width, height, 8, 2, 0, 0, 0)
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + header)

@@ -85,6 +85,11 @@ IMAGES_TXT: Mapping[str, tuple[str, str]] = {
         "line 3: must be the points of image 'a.jpg' as X Y POINT3D_ID, or empty, "
         "found '2 1 0 0 0 0 0 5 7 b.jpg'.",
     ),
+    "no points line before a name of three words": (
+        "1 1 0 0 0 0 0 5 7 a.jpg\n2 1 0 0 0 0 0 5 7 00 left b.jpg",
+        "line 3: must be the points of image 'a.jpg' as X Y POINT3D_ID, or empty, "
+        "found '2 1 0 0 0 0 0 5 7 00 left b.jpg'.",
+    ),
     "unknown camera": (
         "1 1 0 0 0 0 0 5 8 a.jpg",
         "image 'a.jpg' must refer to a camera in the camera file, found camera 8.",

@@ -12,8 +12,15 @@ from cvtgs.evaluation import scorer as scorer_module
 from cvtgs.evaluation.scorer import BLACK, WHITE, Metrics, Scorer, render_views
 from cvtgs.progress import silent
 from cvtgs.refinement import RefineConfig, optimize
-from cvtgs.refinement.images import ImageBuffer, RefineViews, generated_views, split_views
+from cvtgs.refinement.images import (
+    ImageBuffer,
+    RefineViews,
+    generated_views,
+    shared_views,
+    split_views,
+)
 from cvtgs.refinement.optimize import Limits
+from cvtgs.rendering import observe
 from refine_cases import discolored, full_scene, quick, ring
 
 
@@ -191,3 +198,19 @@ def test_small_views_of_one_size_are_scored_together(monkeypatch, pixels, groups
     for row, camera in enumerate(cameras):
         single = Scorer(full, [camera], metrics=Metrics(), backgrounds=(BLACK, WHITE))
         assert single.score(small) == scores[2 * row : 2 * row + 2]
+
+
+def test_cameras_that_see_nothing_are_not_held_out():
+    """An image of nothing is perfect from the start, so no step would be taken."""
+    full, cameras = full_scene(50), ring(16)
+    viewmats = cameras.viewmats.clone()
+    viewmats[[4, 5], :3, 3] += 1000.0
+    away, config = replace(cameras, viewmats=viewmats), RefineConfig(size=32, heldout=2)
+    held = split_views(away, config=config, seed=0, full=full).heldout
+    rows = [row for one in held for row in range(16) if torch.equal(one.viewmats[0], viewmats[row])]
+    assert len(rows) == len(held) == 1
+    assert not {4, 5} & set(rows)
+    observed = observe(full, away.fitted(32))
+    shared = shared_views(observed, full, away, config=config, seed=0)
+    assert len(shared.heldout_images) == 1
+    assert all(bool((image.alpha > 0).any()) for image in shared.heldout_images)

@@ -1,5 +1,7 @@
 """Find views that show nothing of a scene, in which every result would look perfect."""
 
+from collections.abc import Sequence
+
 from jaxtyping import Float
 from torch import Tensor
 
@@ -10,6 +12,7 @@ from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.rendering import BackendName
 from cvtgs.rendering.projection import to_matrices, warn_of_near_plane
 from cvtgs.scene import GaussianScene
+from cvtgs.views.own import FEW, LEAST_FILLED, in_images
 
 PREVIEW = 96  # longer side of images that only tell whether they show anything, pixels
 SAMPLED = 4096  # about how many Gaussians tell whether a camera sees anything of a scene
@@ -33,6 +36,13 @@ def check_seen(
         raise InvalidSceneError(f"{name} must have at least one Gaussian, found none.")
     to_matrices(cameras)  # alone, each would be "camera 0" in errors
     warn_of_near_plane(scene, cameras.singles(), name=name)
+    inside, filled = in_images(cameras, scene)
+    tiny = int(((inside > 0) & (filled < LEAST_FILLED)).sum())
+    if 2 * tiny > len(cameras) and len(scene) >= FEW:
+        warn(
+            f"{name} spans less than {LEAST_FILLED:.0%} of {tiny} of {len(cameras)} images, so "
+            f"scores are mostly those of the background; give cameras of this scene, in its units."
+        )
     points = _drawn(scene)
     blind = cameras.to("cpu").singles()
     for some in (points[:: -(-len(points) // SAMPLED)].cpu(), points):  # all only in doubt
@@ -63,6 +73,21 @@ def shows(scene: GaussianScene, camera: Cameras, alpha: Float[Tensor, "1 h w"]) 
     if float(alpha.mean()) >= LEAST_COVER:
         return True
     return camera.shows_any(_drawn(scene).double())
+
+
+def seeing_rows(scene: GaussianScene, cameras: Cameras) -> Sequence[int]:
+    """Return the rows of cameras with a drawn Gaussian in the image; all if fewer than two.
+
+    An image of nothing would look perfect from the start.
+    """
+    points = _drawn(scene).double()
+    some = points[:: -(-len(points) // SAMPLED)].cpu()
+    found = [
+        row
+        for row, camera in enumerate(cameras.singles())
+        if camera.shows_any(some) or camera.shows_any(points)
+    ]
+    return found if len(found) > 1 else range(len(cameras))
 
 
 def _drawn(scene: GaussianScene) -> Float[Tensor, "n 3"]:

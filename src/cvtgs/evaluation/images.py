@@ -123,10 +123,12 @@ def read_image(
 @contextmanager
 def _opened(path: Path) -> Iterator[None]:
     """Convert errors on reading an image to cvtgs errors."""
-    from PIL import UnidentifiedImageError  # noqa: PLC0415
+    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415
 
     try:
         yield
+    except Image.DecompressionBombError as error:
+        raise FileFormatError(f"{path}: must have fewer pixels; {error}") from error
     except UnidentifiedImageError as error:
         raise FileFormatError(f"{path}: must be an image, found something else.") from error
     except (OSError, SyntaxError, ValueError) as error:
@@ -179,10 +181,10 @@ def load_photographs(
 ) -> Float[Tensor, "c h w 3"]:
     """Read the photograph of every camera, at the cameras' size.
 
-    The file name in the folder is the camera's name, or the last part of that name; the suffix may
-    differ or be missing in the camera's name. Other files, such as masks, are ignored; transparent
-    pixels show the background. Photographs of another size are scaled to that of the cameras, in
-    width and height independently.
+    The file name in the folder is the camera's name, or as many of its last parts as there are in
+    the folder; the suffix may differ or be missing in the camera's name. Other files, such as
+    masks, are ignored; transparent pixels show the background. Photographs of another size are
+    scaled to that of the cameras, in width and height independently.
 
     Memory: ``12 c h w`` bytes.
 
@@ -212,7 +214,10 @@ def load_photographs(
     """
     size = (cameras.width, cameras.height)
     paths = _find_all(Path(folder), cameras)
-    return torch.from_numpy(np.stack([read_image(path, size, background) for path in paths]))
+    images = torch.empty(len(paths), cameras.height, cameras.width, 3, dtype=torch.float32)
+    for image, path in zip(images, paths, strict=True):
+        image.copy_(torch.from_numpy(read_image(path, size, background)))
+    return images
 
 
 @checked
@@ -293,11 +298,11 @@ def _find_all(place: Path, cameras: Cameras) -> list[Path]:
 
 
 def _find(folder: Path, name: str) -> Path | None:
-    """Look for the whole name, then for its last part; for each as it is, then by suffix."""
+    """Look for the whole name, then for fewer of its last parts; each as it is, then by suffix."""
     whole = PurePosixPath(name.replace("\\", "/"))
     parts = [part for part in whole.parts if part not in ("/", ".", "..")]
-    for inner in (PurePosixPath(*parts), PurePosixPath(whole.name)):
-        exact = folder / inner
+    for first in range(len(parts)):
+        exact = folder.joinpath(*parts[first:])
         if exact.suffix.lower() in SUFFIXES and exact.is_file():
             return exact
         base = exact.with_suffix("") if exact.suffix.lower() in SUFFIXES else exact

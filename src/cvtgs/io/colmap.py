@@ -240,7 +240,8 @@ def _images_of_txt(path: Path) -> list[_Image]:
                 continue
             images.append(_image_of_line(line, f"{path}: line {number}"))
             number_of_points, points = next(lines, (number + 1, ""))
-            if len(points.split()) % 3:
+            words = points.split()
+            if len(words) % 3 or not all(word.lstrip("-").isdecimal() for word in words[2::3]):
                 raise _wrong(
                     f"{path}: line {number_of_points}",
                     f"the points of image {shown(images[-1].name)} as X Y POINT3D_ID, or empty",

@@ -186,7 +186,7 @@ def _focal(levels: Sequence[tuple[_Intrinsics, str]], axis: str, *, pixels: int)
 def _size(frame: _Frame, *, path: Path, where: str) -> tuple[int, int]:
     if frame.w is not None and frame.h is not None:
         return frame.w, frame.h
-    image = path.parent / frame.file_path
+    image = path.parent / frame.file_path.replace("\\", "/")  # of Windows
     for candidate in (image, Path(f"{image}.png")):
         if is_file(candidate):
             return _png_size(candidate)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.config import RefineConfig
+from cvtgs.evaluation.blind_views import seeing_rows
 from cvtgs.evaluation.scorer import ViewImages, render_views
 from cvtgs.losses import SSIM_WINDOW
 from cvtgs.rendering import ObservedViews
@@ -51,12 +52,18 @@ def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> 
     return RefineViews(heldout=heldout, training=training(), endless=True)
 
 
-def split_views(cameras: Cameras, *, config: RefineConfig, seed: int) -> RefineViews:
-    """Split given cameras, at least 2, into evenly spread held-out views and training views."""
+def split_views(
+    cameras: Cameras, *, config: RefineConfig, seed: int, full: GaussianScene | None = None
+) -> RefineViews:
+    """Split given cameras, at least 2, into evenly spread held-out views and training views.
+
+    Held-out ones are among those that see the full scene, if it is given.
+    """
+    seeing = range(len(cameras)) if full is None else seeing_rows(full, cameras)
     side = min(config.size, max(cameras.width, cameras.height))
     sized = cameras.fitted(side, least=SSIM_WINDOW * config.stride)
     views = sized.in_two_sizes(config.fine_factor).singles()
-    held = _heldout_rows(len(views), config)
+    held = _heldout_rows(seeing, config)
     others = [view for row, view in enumerate(views) if row not in held]
     random.Random(seed).shuffle(others)
     heldout = _thinned([views[row] for row in held], config.stride)
@@ -75,7 +82,8 @@ def shared_views(
     rgb, alpha = observed.rgb.to(full.device), observed.alpha.to(full.device)
     whole = ViewImages(cameras=observed.cameras, rgb=rgb, alpha=alpha)
     images = [whole.select(row) for row in range(len(observed.cameras))]
-    held = _heldout_rows(len(images), config)
+    shown = (alpha.flatten(1).amax(dim=1) > 0).nonzero()[:, 0].tolist()
+    held = _heldout_rows(shown if len(shown) > 1 else range(len(images)), config)
     further = _further(observed.cameras, full, cameras, config=config, seed=seed)
     return RefineViews(
         heldout=(),
@@ -104,10 +112,11 @@ def _further(
             yield view
 
 
-def _heldout_rows(count: int, config: RefineConfig) -> tuple[int, ...]:
-    """Return the row numbers of the held-out views, spread evenly."""
+def _heldout_rows(rows: Sequence[int], config: RefineConfig) -> tuple[int, ...]:
+    """Return some row numbers of views, spread evenly, which are held out."""
+    count = len(rows)
     number = config.heldout_of(count)
-    return tuple((2 * k + 1) * count // (2 * number) for k in range(number))
+    return tuple(rows[(2 * k + 1) * count // (2 * number)] for k in range(number))
 
 
 def _thinned(views: Sequence[Cameras], stride: int) -> tuple[Cameras, ...]:

@@ -255,7 +255,7 @@ def _views(
     if observed is not None and len(observed.cameras) > 1:
         return shared_views(observed, full, cameras, config=config, seed=seed)
     if cameras is not None:
-        return split_views(cameras, config=config, seed=seed)
+        return split_views(cameras, config=config, seed=seed, full=full)
     views = generated_views(full, config=config, seed=seed)
     warn_of_near_plane(full, views.heldout, name="the full scene")
     return views

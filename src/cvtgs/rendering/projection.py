@@ -340,6 +340,7 @@ def warn_of_near_plane(scene: GaussianScene, cameras: Sequence[Cameras], *, name
     shares = []
     for camera in cameras:
         view, intrinsics = camera.viewmats[0].to(points), camera.Ks[0].to(points)
+        view = view / view_scales(camera.viewmats).to(points)
         x, y, depth = intrinsics @ (view[:3, :3] @ points.T + view[:3, 3:])
         # Behind the camera, no number is between 0 and a negative one.
         ahead = (x >= 0) & (x <= camera.width * depth) & (y >= 0) & (y <= camera.height * depth)

@@ -1,12 +1,13 @@
 """The cameras of a capture, if they are in the folder of its model."""
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
@@ -14,6 +15,10 @@ from cvtgs.errors import CvtgsError, FileFormatError, check_path, warn
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
 
 _LEAST_SEEN = 0.01  # share of the visible Gaussians in the image of a camera that looks at a scene
+LEAST_FILLED = 0.01  # share of an image that a scene spans, from which on cameras are of its scale
+FEW = 100  # a scene of fewer Gaussians may be small in all images
+_MIDDLE = 0.1  # quantile from which to the opposite one a scene is measured
+_NERFSTUDIO = re.compile("(?i)nerf?studio")  # its exporter misspells itself
 _LEAST_LOOKING = 0.5
 _MOST_POINTS = 2000
 _VISIBLE = 0.1
@@ -46,8 +51,10 @@ def find_own_cameras(scene: SceneLike, path: str | os.PathLike[str]) -> OwnCamer
 
     The folder of the model (in INRIA's layout the one above ``point_cloud``) and then the folder of
     the file are searched for formats that :func:`cvtgs.io.load_cameras` reads. Cameras of another
-    world frame, as after a capture was moved or scaled, are rejected: at least half of the cameras
-    must have a hundredth of the visible Gaussians in their images. A damaged file causes a warning.
+    world frame, as after a capture was moved or scaled, are rejected: in at least half of the
+    images there must be a hundredth of the visible Gaussians, which span at least 1 % of the image.
+    nerfstudio moves and scales the scenes that it exports, so cameras beside these are not used.
+    A damaged file causes a warning.
 
     Args:
         scene: The scene, as it was read, or its path.
@@ -70,6 +77,8 @@ def find_own_cameras(scene: SceneLike, path: str | os.PathLike[str]) -> OwnCamer
 
     scene = as_scene(scene)
     check_path(path)
+    if any(map(_NERFSTUDIO.search, scene.comments)):
+        return None
     place, faults = Path(path), set[str]()
     for source in _sources(place) if place.exists() else ():
         try:
@@ -103,16 +112,31 @@ def _sources(path: Path) -> Iterator[Path]:
 
 
 def _looking(cameras: Cameras, scene: GaussianScene) -> Bool[Tensor, "c"]:
-    """Return which cameras have enough of the visible Gaussians in their images."""
+    """Return which cameras have enough of the visible Gaussians in their images, not tiny."""
+    inside, filled = in_images(cameras, scene)
+    return (inside >= _LEAST_SEEN) & ((filled >= LEAST_FILLED) | (len(scene) < FEW))
+
+
+def in_images(
+    cameras: Cameras, scene: GaussianScene
+) -> tuple[Float[Tensor, "c"], Float[Tensor, "c"]]:
+    """Return the shares of the visible Gaussians in images, and of images that these span.
+
+    They span what lies between the first and the last tenth of their centres in width and height.
+    """
     rows = (scene.opacities > _VISIBLE).nonzero()[:, 0]
     rows = rows[:: max(1, -(-len(rows) // _MOST_POINTS))]
     points = scene.means[rows].double().cpu()
     points = points[torch.isfinite(points).all(dim=1)]
     if len(points) == 0:
-        return torch.zeros(len(cameras), dtype=torch.bool, device="cpu")
+        none = torch.zeros(len(cameras), dtype=torch.float64, device="cpu")
+        return none, none
     viewmats, intrinsics = cameras.viewmats.double().cpu(), cameras.Ks.double().cpu()
     local = points @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
     x, y, z = (local @ intrinsics.transpose(1, 2)).unbind(2)
     inside = (z > 0) & (x > 0) & (x < cameras.width * z) & (y > 0) & (y < cameras.height * z)
-    seen: Tensor = inside.double().mean(dim=1) >= _LEAST_SEEN
-    return seen
+    ends, filled = x.new_tensor([_MIDDLE, 1.0 - _MIDDLE]), x.new_ones(len(cameras))
+    for axis, size in ((x, cameras.width), (y, cameras.height)):
+        low, high = torch.where(inside, axis / z, torch.nan).nanquantile(ends, dim=1)
+        filled *= ((high - low) / size).nan_to_num(0.0)
+    return inside.double().mean(dim=1), filled
