@@ -91,7 +91,7 @@ def merge_pairs(
     table = torch.cat([torch.atleast_2d(values).float() for values in groups])  # fast to gather
     total, device = len(groups.masses), groups.masses.device
     labels = torch.arange(total, device=device)
-    pairs = _distinct_pairs(labels.repeat_interleave(neighbors.shape[1]), neighbors.flatten())
+    pairs = _distinct_pairs(labels[:, None].expand_as(neighbors), neighbors)
     while total > count:
         if len(pairs) == 0:  # no neighbouring pairs are left: merge arbitrary ones
             rows = torch.arange(total, device=device)
@@ -126,13 +126,22 @@ def _relative_contrast(colors: Float[Tensor, "3 m"], neighbors: Int[Tensor, "m k
     return min(max(contrast, LEAST_CONTRAST), LARGEST_CONTRAST)
 
 
-def _distinct_pairs(first: Int[Tensor, "p"], second: Int[Tensor, "p"]) -> Int[Tensor, "q"]:
+def _distinct_pairs(first: Tensor, second: Tensor) -> Int[Tensor, "q"]:
     """Return a key of each unordered pair of different groups, ascending.
 
     The upper bits of a key are the smaller of the two groups, the lower ones the other.
     """
-    keys = (torch.minimum(first, second) << ROW_BITS).bitwise_or_(torch.maximum(first, second))
-    keys = torch.sort(keys.index_select(0, (first != second).nonzero()[:, 0])).values
+
+    def keys_of(part: slice) -> Tensor:
+        one, two = first[part], second[part]
+        keys = (torch.minimum(one, two) << ROW_BITS).bitwise_or_(torch.maximum(one, two))
+        return torch.masked_select(keys, one != two)
+
+    keys = torch.cat(in_chunks(keys_of, len(first), CHUNK, first.device))
+    if keys.device.type == "cpu":
+        keys.numpy().sort(kind="stable")  # in place, and fast, since long runs are in order
+    else:
+        keys = torch.sort(keys).values
     is_new = torch.ones(len(keys), dtype=torch.bool, device=keys.device)
     torch.ne(keys[1:], keys[:-1], out=is_new[1:])
     return keys.index_select(0, is_new.nonzero()[:, 0])
@@ -239,7 +248,8 @@ def _cheapest_disjoint(
     many rounds as pairs, so a loop finishes what is left.
     """
     # Bits of positive floats are in the order of the floats, so these keys are in that of costs.
-    keys = costs.view(torch.int32).long() << ROW_BITS
+    keys = costs.view(torch.int32).long()
+    keys <<= ROW_BITS
     keys |= torch.arange(len(keys), device=keys.device)
     i, j, is_free = first, second, torch.ones(total, dtype=torch.bool, device=keys.device)
     taken, count = list[Tensor](), 0
