@@ -112,8 +112,8 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     "--ckpt": {
         "metavar": "NAME",
         "default": "auto",
-        "help": "MergeNet checkpoint: auto (default: that of the preset), standard, paper, a "
-        "file, or none to merge by moments alone",
+        "help": "MergeNet checkpoint: auto (default: that of the preset), standard, paper or a "
+        "file, which also set the preset if none is given, or none to merge by moments alone",
     },
     "--config": {"metavar": "FILE", "type": any_path, "help": "settings, or an earlier report"},
     "--set": {
