@@ -22,6 +22,7 @@ def viewer() -> SceneViewer:
     return SceneViewer(random_scene(500, degree=0, size=0.05), device="cpu")
 
 
+@pytest.mark.skipif(os.name == "nt", reason="os.kill ends the process on Windows")
 def test_an_interrupt_waits_for_the_simplification(
     viewer: SceneViewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:

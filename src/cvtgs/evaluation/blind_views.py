@@ -12,7 +12,7 @@ from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.rendering import BackendName
 from cvtgs.rendering.projection import to_matrices, warn_of_near_plane
 from cvtgs.scene import GaussianScene
-from cvtgs.views.own import FEW, LEAST_FILLED, in_images
+from cvtgs.views.own import FEW, LEAST_FILLED, MOST_TRIED, in_images
 
 PREVIEW = 96  # longer side of images that only tell whether they show anything, pixels
 SAMPLED = 4096  # about how many Gaussians tell whether a camera sees anything of a scene
@@ -36,12 +36,11 @@ def check_seen(
         raise InvalidSceneError(f"{name} must have at least one Gaussian, found none.")
     to_matrices(cameras)  # alone, each would be "camera 0" in errors
     warn_of_near_plane(scene, cameras.singles(), name=name)
-    inside, filled = in_images(cameras, scene)
-    tiny = int(((inside > 0) & (filled < LEAST_FILLED)).sum())
-    if 2 * tiny > len(cameras) and len(scene) >= FEW:
+    inside, filled = in_images(cameras.spread(MOST_TRIED), scene)
+    if len(scene) >= FEW and float(((inside > 0) & (filled < LEAST_FILLED)).double().mean()) > 0.5:
         warn(
-            f"{name} spans less than {LEAST_FILLED:.0%} of {tiny} of {len(cameras)} images, so "
-            f"scores are mostly those of the background; give cameras of this scene, in its units."
+            f"{name} spans less than {LEAST_FILLED:.0%} of most images, so they show mostly "
+            f"background; give cameras of this scene, in its units."
         )
     points = _drawn(scene)
     blind = cameras.to("cpu").singles()

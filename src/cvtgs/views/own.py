@@ -16,6 +16,7 @@ from cvtgs.scene import GaussianScene, SceneLike, as_scene
 
 _LEAST_SEEN = 0.01  # share of the visible Gaussians in the image of a camera that looks at a scene
 LEAST_FILLED = 0.01  # share of an image that a scene spans, from which on cameras are of its scale
+MOST_TRIED = 500  # cameras that tell whether all are of a scene
 FEW = 100  # a scene of fewer Gaussians may be small in all images
 _MIDDLE = 0.1  # quantile from which to the opposite one a scene is measured
 _NERFSTUDIO = re.compile("(?i)nerf?studio")  # its exporter misspells itself
@@ -90,7 +91,7 @@ def find_own_cameras(scene: SceneLike, path: str | os.PathLike[str]) -> OwnCamer
             continue
         except CvtgsError:  # there are none
             continue
-        looking = float(_looking(cameras, scene).double().mean())
+        looking = float(_looking(cameras.spread(MOST_TRIED), scene).double().mean())
         if len(cameras) > 1 and looking >= _LEAST_LOOKING:
             return OwnCameras(cameras, source)
     return None
