@@ -163,7 +163,7 @@ def test_stages_give_the_same_bits_in_two_threads(two_threads, monkeypatch):
     two = cvtgs.Simplifier(device="cpu").simplify(scene, 0.1)
     with one_thread():
         assert same_bits(two, cvtgs.Simplifier(device="cpu").simplify(scene, 0.1))
-    in_allocation = {"moments_of", "costs_of", "join", "search"}
+    in_allocation = {"moments_of", "keys_of", "costs_of", "join", "search"}
     assert handed_over == in_allocation | {"merge_chunk", "inflate", "correct"}
 
 

@@ -160,7 +160,9 @@ def test_without_resume_a_training_starts_over(scenes, cache, tmp_path):
     with pytest.raises(PowerCutError):
         run(config_of(scenes), path, cache, listener=interrupting(5))
     before = path.read_bytes()
-    with pytest.raises(OutputExistsError, match=r"net\.state: there is a training to resume"):
+    with pytest.raises(
+        OutputExistsError, match=r"net\.state: the output must not exist yet, found the state"
+    ):
         run(config_of(scenes), path, cache)
     path.with_suffix(".state").rename(tmp_path / "elsewhere")
     with pytest.raises(OutputExistsError, match=r"net\.safetensors: the output must not exist yet"):

@@ -130,8 +130,8 @@ def train(
     resumes = resume and has_state
     if has_state and not (resume or overwrite):
         text = (
-            f"{files.state}: there is a training to resume, with resume=True (--resume), or to "
-            f"replace, with overwrite=True (--overwrite)."
+            f"{files.state}: the output must not exist yet, found the state of a training; pass "
+            f"resume=True (--resume) to continue it, or overwrite=True (--overwrite) to replace it."
         )
         raise OutputExistsError(text).about(files.state, errno.EEXIST)
     for path in (files.checkpoint, files.state, files.curves):
