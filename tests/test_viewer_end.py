@@ -50,6 +50,8 @@ def test_closing_ends_a_simplification_at_its_next_stage(viewer: SceneViewer) ->
     viewer.stop()
     with pytest.raises(RunError, match="the viewer was stopped during "):
         viewer.simplify("draft", 0.2)
+    ViewerServer(viewer).close()
+    assert len(viewer.simplify("draft", 0.2).scene) == 100
 
 
 def test_facts_come_back_after_an_error(

@@ -100,8 +100,12 @@ class SceneViewer:
         return self.scenes[SIMPLIFIED]
 
     def stop(self) -> None:
-        """End a running simplification at its next stage or step, with an error, and later ones."""
+        """End a running simplification at its next stage or step, and later ones, with an error."""
         self._is_stopped = True
+
+    def resume(self) -> None:
+        """Allow simplifications again."""
+        self._is_stopped = False
 
     def _go_on(self, event: ProgressEvent) -> None:
         """Raise if the viewer was stopped."""

@@ -269,6 +269,7 @@ class ViewerServer:
         self._viewer.stop()
         self._wanted.set()
         self._ended.wait()
+        self._viewer.resume()  # another server may show it
         stop_server(self._server)
 
     def _work(self) -> None:
