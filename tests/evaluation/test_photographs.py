@@ -10,15 +10,15 @@ from cvtgs.evaluation import fit_cameras, load_photographs
 from cvtgs.evaluation.images import encode, read_image
 
 
+def rig_of(*names: str) -> cvtgs.Cameras:
+    count = len(names)
+    viewmats, Ks = torch.eye(4).expand(count, 4, 4), torch.eye(3).expand(count, 3, 3)  # noqa: N806
+    return cvtgs.Cameras(viewmats=viewmats, Ks=Ks, width=48, height=36, names=names)
+
+
 def test_a_photograph_of_two_cameras_is_an_error(tmp_path):
     """The folder is that of the left camera; its images have the same names as the right ones."""
-    rig = cvtgs.Cameras(
-        viewmats=torch.eye(4).expand(2, 4, 4),
-        Ks=torch.eye(3).expand(2, 3, 3),
-        width=48,
-        height=36,
-        names=("left/1.png", "right/1.png"),
-    )
+    rig = rig_of("left/1.png", "right/1.png")
     content = encode(np.full((36, 48, 3), 50, np.uint8), "png")
     (tmp_path / "1.png").write_bytes(content)
     for use in (lambda: load_photographs(tmp_path, rig), lambda: fit_cameras(rig, tmp_path)):
@@ -104,16 +104,10 @@ def test_upright_photographs_may_have_pixels_that_are_not_quite_square(tmp_path)
 
 def test_a_photograph_lies_in_the_folder_by_any_last_parts_of_its_name(tmp_path):
     """As of a rig whose names begin with a folder that was scaled: images/left/1.png."""
-    rig = cvtgs.Cameras(
-        viewmats=torch.eye(4).expand(2, 4, 4),
-        Ks=torch.eye(3).expand(2, 3, 3),
-        width=8,
-        height=8,
-        names=("images/left/1.png", "images/right/1.png"),
-    )
+    rig = rig_of("images/left/1.png", "images/right/1.png")
     for value, side in ((50, "left"), (100, "right")):
         (tmp_path / "images_4" / side).mkdir(parents=True)
-        content = encode(np.full((8, 8, 3), value, np.uint8), "png")
+        content = encode(np.full((36, 48, 3), value, np.uint8), "png")
         (tmp_path / "images_4" / side / "1.png").write_bytes(content)
     found = load_photographs(tmp_path / "images_4", rig)
     assert (found[:, 0, 0, 0] * 255).round().tolist() == [50, 100]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.config import RefineConfig
-from cvtgs.evaluation.blind_views import seeing_rows
+from cvtgs.evaluation.blind_views import LEAST_COVER, seeing_rows
 from cvtgs.evaluation.scorer import ViewImages, render_views
 from cvtgs.losses import SSIM_WINDOW
 from cvtgs.rendering import ObservedViews
@@ -82,7 +82,7 @@ def shared_views(
     rgb, alpha = observed.rgb.to(full.device), observed.alpha.to(full.device)
     whole = ViewImages(cameras=observed.cameras, rgb=rgb, alpha=alpha)
     images = [whole.select(row) for row in range(len(observed.cameras))]
-    shown = (alpha.flatten(1).amax(dim=1) > 0).nonzero()[:, 0].tolist()
+    shown = (alpha.flatten(1).mean(dim=1) >= LEAST_COVER).nonzero()[:, 0].tolist()
     held = _heldout_rows(shown if len(shown) > 1 else range(len(images)), config)
     further = _further(observed.cameras, full, cameras, config=config, seed=seed)
     return RefineViews(
