@@ -109,7 +109,7 @@ def test_a_target_out_of_reach_of_the_format_says_so(capsys, source):
 
 @pytest.mark.parametrize(
     ("views", "heldout", "where"),
-    [(4, 4, "the same images"), (32, 4, "4 of them, which are held out")],
+    [(4, 4, "the same images"), (8, 1, "1 held-out image"), (32, 4, "4 held-out images")],
 )
 def test_the_images_that_a_matching_is_scored_on_are_named(views, heldout, where):
     matched = MatchReport(

@@ -136,7 +136,7 @@ def report_notes(report: "SimplifyReport") -> list[str]:
         notes.append("No images were rendered, since no Gaussians had to merge.")
     if report.matching is not None:
         matched = report.matching
-        where = f"{matched.heldout} of them, which are held out"
+        where = counted(matched.heldout, "held-out image")
         if matched.heldout == matched.views:
             where = "the same images"
         notes.append(
