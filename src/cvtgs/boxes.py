@@ -33,7 +33,7 @@ MaskLike = Bool[Tensor, "n"] | NDArray[np.bool_] | Sequence[bool]
 """A mask of the Gaussians of a scene."""
 
 
-class Box(pydantic.BaseModel):
+class Box(pydantic.BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """An axis-aligned box, faces included.
 
     Attributes:
@@ -48,8 +48,6 @@ class Box(pydantic.BaseModel):
         >>> Box(min=(0, 0, 0), max=(1, 1, 1)).max
         (1.0, 1.0, 1.0)
     """
-
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     min: Corner
     max: Corner

@@ -21,7 +21,7 @@ def check_listener(listener: object) -> None:
         )
 
 
-class StageCost(pydantic.BaseModel):
+class StageCost(pydantic.BaseModel, frozen=True, extra="forbid"):
     """The cost of one stage.
 
     Attributes:
@@ -33,8 +33,6 @@ class StageCost(pydantic.BaseModel):
         peak_device_memory_bytes: Peak size of all tensors of the process on a CUDA device during
             the stage, including those allocated earlier; 0 on other devices.
     """
-
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
     stage: str
     seconds: float

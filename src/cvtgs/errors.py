@@ -83,6 +83,9 @@ class FileFormatError(CvtgsError, ValueError):
 class _FileError(CvtgsError, OSError):
     """Base of errors about a file; ``filename`` and ``errno`` are set if they are known."""
 
+    filename: Any
+    errno: int | None
+
     def __reduce__(self) -> tuple[Any, ...]:
         return _file_error, (type(self), self.args, self.errno, self.filename)
 

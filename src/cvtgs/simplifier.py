@@ -11,7 +11,7 @@ from cvtgs.clock import check_listener
 from cvtgs.config import SimplifyConfig
 from cvtgs.devices import chosen_device
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.mergenet.checkpoint import checkpoint_for
+from cvtgs.mergenet.checkpoint import Checkpoint, checkpoint_for
 from cvtgs.prepared import Prepared
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified
@@ -58,8 +58,8 @@ class Simplifier:
     ) -> None:
         check_listener(listener)
         chosen = _chosen_config(config, preset)
-        self.checkpoint = checkpoint_for(ckpt, chosen)
-        self.config = chosen or SimplifyConfig(
+        self.checkpoint: Checkpoint | None = checkpoint_for(ckpt, chosen)
+        self.config: SimplifyConfig = chosen or SimplifyConfig(
             preset="standard" if self.checkpoint is None else self.checkpoint.info.preset
         )
         self._device = None if device == "auto" else chosen_device(device)

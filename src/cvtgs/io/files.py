@@ -7,7 +7,7 @@ import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, BinaryIO, TypeVar, get_args
+from typing import Annotated, Any, BinaryIO, ClassVar, TypeVar, get_args
 
 import pydantic
 from pydantic import AllowInfNan, BeforeValidator, Field, Strict
@@ -199,7 +199,7 @@ def check_stored(path: Path, tensors: Mapping[str, Tensor]) -> None:
 class Document(pydantic.BaseModel):
     """A JSON object of which some keys are read; errors quote the descriptions of fields."""
 
-    model_config = pydantic.ConfigDict(frozen=True)
+    model_config: ClassVar[pydantic.ConfigDict] = pydantic.ConfigDict(frozen=True)
 
 
 def _without_point(value: Any) -> Any:

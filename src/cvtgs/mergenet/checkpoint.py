@@ -54,7 +54,10 @@ class LearnedScene(Record):
     cameras_sha256: str = ""
 
 
-KINDS = {"gated": Architecture, "published": PublishedArchitecture}
+KINDS: dict[str, type[Architecture | PublishedArchitecture]] = {
+    "gated": Architecture,
+    "published": PublishedArchitecture,
+}
 """Classes of the network architectures by kind."""
 
 

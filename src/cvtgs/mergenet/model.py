@@ -158,16 +158,16 @@ class MergeNet(CellNetwork):
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
-        self.architecture = architecture
+        self.architecture: Architecture = architecture
         width, cell_width = architecture.width, architecture.cell_width
         pooled = architecture.cell_features + 5 * width
-        self.member_layers = two_layers(architecture.member_features, width)
-        self.pair_layers = two_layers(architecture.pair_features, width)
-        self.cell_layers = two_layers(pooled, cell_width)
-        self.decoder = Linear(cell_width, 4)
-        self.member_gates = _Gates(width, cell_width)
-        self.pair_gates = _Gates(width, cell_width)
-        self.known = KnownRange()
+        self.member_layers: nn.Sequential = two_layers(architecture.member_features, width)
+        self.pair_layers: nn.Sequential = two_layers(architecture.pair_features, width)
+        self.cell_layers: nn.Sequential = two_layers(pooled, cell_width)
+        self.decoder: Linear = Linear(cell_width, 4)
+        self.member_gates: _Gates = _Gates(width, cell_width)
+        self.pair_gates: _Gates = _Gates(width, cell_width)
+        self.known: KnownRange = KnownRange()
         nn.init.zeros_(self.decoder.weight)
         nn.init.zeros_(self.decoder.bias)
 
@@ -230,10 +230,10 @@ class _Gates(nn.Module):
 
     def __init__(self, width: int, cell_width: int) -> None:
         super().__init__()
-        self.own = Linear(width, width)
-        self.cell = Linear(cell_width, width, bias=False)
-        self.gates = Linear(width, 5)
-        self.activation = _SiLU()
+        self.own: Linear = Linear(width, width)
+        self.cell: Linear = Linear(cell_width, width, bias=False)
+        self.gates: Linear = Linear(width, 5)
+        self.activation: nn.Module = _SiLU()
         nn.init.zeros_(self.gates.weight)
         nn.init.zeros_(self.gates.bias)
 

@@ -144,9 +144,9 @@ class PublishedMergeNet(CellNetwork):
         super().__init__()
         self.architecture = architecture
         width, cell_width = architecture.width, architecture.cell_width
-        self.member_layers = two_layers(architecture.member_features, width)
-        self.decoder = two_layers(3 * width, cell_width)
-        self.residuals = Linear(cell_width, PUBLISHED_RESIDUALS)
+        self.member_layers: nn.Sequential = two_layers(architecture.member_features, width)
+        self.decoder: nn.Sequential = two_layers(3 * width, cell_width)
+        self.residuals: Linear = Linear(cell_width, PUBLISHED_RESIDUALS)
         nn.init.zeros_(self.residuals.weight)
         nn.init.zeros_(self.residuals.bias)
 

@@ -156,7 +156,7 @@ class ImageBuffer:
         self._rng = random.Random(seed)
         self._kept = [(image, 1) for image in views.images]  # with what is left of the stride
         self._drawn = len(self._kept)
-        self.rendered = 0
+        self.rendered: int = 0
 
     def draw_step(self) -> list[ViewImages]:
         """Return the training images of a step, those of one size together."""

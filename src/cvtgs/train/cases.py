@@ -187,7 +187,8 @@ class DeviceCopies:
     """
 
     def __init__(self, device: torch.device, room: int | None = None) -> None:
-        self.device, self._room = device, room or DEVICE_BYTES
+        self.device: torch.device = device
+        self._room = room or DEVICE_BYTES
         if room is None and device.type == "cuda":
             self._room = torch.cuda.mem_get_info(device)[0] // 2
         # The originals are kept with the copies, so that their ids are not reused.

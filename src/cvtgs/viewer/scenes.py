@@ -72,7 +72,7 @@ class SceneViewer:
             )
         self._scene, self._device, self._is_stopped = scene, device, False
         self._prepared: dict[str, Prepared] = {}
-        self.scenes = {FULL: ShownScene(scene, _counted(scene, scene))}
+        self.scenes: dict[str, ShownScene] = {FULL: ShownScene(scene, _counted(scene, scene))}
         for name, other in (others or {}).items():
             self.scenes[name] = ShownScene(other, _counted(other, scene))
 

@@ -101,7 +101,8 @@ class SceneNode:
     """A scene on a server, and a label with its name that is shown and hidden with it."""
 
     def __init__(self, server: "viser.ViserServer", name: str, path: str, *, label: Point) -> None:
-        self._server, self.name = server, printable_name(name)
+        self.name: str = printable_name(name)
+        self._server = server
         self._path, self._label = path, label
         self._splats: Any = None
         self._lock = threading.Lock()  # controls are used in other threads than scenes are drawn
