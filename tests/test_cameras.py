@@ -151,9 +151,12 @@ def test_cameras_are_selected_by_rows_and_by_masks():
     three = Cameras(
         **GOOD | {"viewmats": views, "Ks": torch.eye(3).repeat(3, 1, 1)}, names=("a", "b", "c")
     )
-    for rows in (torch.tensor([0, 2]), torch.tensor([True, False, True]), [0, -1]):
-        found = three.select(rows)
-        assert (found.names, found.viewmats[:, 0, 0].tolist()) == (("a", "c"), [1, 3])
+    mask = torch.tensor([True, False, True])
+    for rows in (torch.tensor([0, 2]), mask, mask.numpy(), [0, -1], slice(0, 3, 2)):
+        for found in (three.select(rows), three[rows]):
+            assert (found.names, found.viewmats[:, 0, 0].tolist()) == (("a", "c"), [1, 3])
+    with pytest.raises(InvalidArgumentError, match=r"found 0; write \[0\] for a single one"):
+        three[0]
     with pytest.raises(InvalidArgumentError, match="for each of 3 cameras, found 2"):
         three.select(torch.tensor([True, False]))
     with pytest.raises(InvalidArgumentError, match="must be from -3 to 2, found 3"):

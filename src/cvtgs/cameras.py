@@ -7,10 +7,10 @@ from itertools import chain
 from typing import Any, Self
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.checks import check_kinds, checked, row_numbers
+from cvtgs.checks import Rows, check_kinds, checked, row_numbers
 from cvtgs.counts import checked_whole, spread_rows, whole_number
 from cvtgs.devices import usable_device, without_autocast
 from cvtgs.errors import InvalidArgumentError
@@ -81,11 +81,9 @@ class Cameras:
             object.__setattr__(self, name, tuple(values))
 
     def __repr__(self) -> str:
-        """Return number, image size and device, not the matrices."""
         return f"Cameras({len(self)} of {self.width} x {self.height} pixels, {self.Ks.device})"
 
     def __len__(self) -> int:
-        """Return the number of cameras."""
         return len(self.viewmats)
 
     @property
@@ -101,11 +99,11 @@ class Cameras:
         centers = -(rotations.transpose(1, 2) @ shifts)[:, :, 0]
         return centers / view_scales(self.viewmats)[:, None].square()
 
-    def select(self, rows: Sequence[int] | Int[Tensor, "m"] | Bool[Tensor, "c"]) -> Self:
-        """Return some of the cameras.
+    def select(self, rows: Rows) -> Self:
+        """Return some of the cameras, as ``cameras[rows]`` does.
 
         Args:
-            rows: Indices of the cameras, or a mask.
+            rows: A slice, indices of the cameras, or a mask.
 
         Returns:
             The selected cameras.
@@ -114,13 +112,15 @@ class Cameras:
             InvalidArgumentError: A mask has not one entry per camera, or an index is out of range.
         """
         device = rows.device if isinstance(rows, Tensor) else torch.device("cpu")
-        rows = row_numbers(rows, len(self), things="cameras", device=device)
+        chosen = row_numbers(rows, len(self), things="cameras", device=device)
         entries: dict[str, Any] = {
-            name: tuple(values[row] for row in rows.tolist())
+            name: tuple(values[row] for row in chosen.tolist())
             for name in ("names", "strides", "ignores_tag")
             if (values := getattr(self, name))
         }
-        return replace(self, viewmats=self.viewmats[rows], Ks=self.Ks[rows], **entries)
+        return replace(self, viewmats=self.viewmats[chosen], Ks=self.Ks[chosen], **entries)
+
+    __getitem__ = select
 
     def singles(self) -> list[Self]:
         """Split into single cameras.
@@ -130,7 +130,7 @@ class Cameras:
         """
         if len(self) == 1:  # a selection would copy the row number to the device
             return [self]
-        return [self.select([row]) for row in range(len(self))]
+        return [self[[row]] for row in range(len(self))]
 
     def to(self, device: torch.device | str) -> Self:
         """Move the cameras to a device.

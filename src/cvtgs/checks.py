@@ -9,11 +9,13 @@ from typing import Any, ParamSpec, TypeVar, get_args
 import numpy as np
 import torch
 from jaxtyping import Int, jaxtyped
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.text import shown
 
+Rows = slice | Sequence[int] | NDArray[Any] | Tensor  # or a mask
 P = ParamSpec("P")
 Result = TypeVar("Result")
 
@@ -104,9 +106,7 @@ def check_amounts(amounts: object, name: str, count: int, *, ignored: int = 0) -
         )
 
 
-def row_numbers(
-    rows: slice | Sequence[int] | Tensor, count: int, *, things: str, device: torch.device
-) -> Int[Tensor, "m"]:
+def row_numbers(rows: Rows, count: int, *, things: str, device: torch.device) -> Int[Tensor, "m"]:
     """Return the numbers of the selected rows, from 0 on, as int32 or int64.
 
     ``rows`` is a slice, a mask, or row numbers, of which negative ones count from the end.

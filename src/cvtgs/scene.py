@@ -1,18 +1,17 @@
 """GaussianScene: the Gaussians of a scene in stored (not activated) parameters."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import Any, BinaryIO, Literal, Self
 
 import torch
-from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
+from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.checks import row_numbers
+from cvtgs.checks import Rows, row_numbers
 from cvtgs.counts import whole_number
 from cvtgs.devices import row_chunks, usable_device
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
@@ -206,38 +205,28 @@ class GaussianScene:
         """
         return {name: getattr(self, name) for name in _TENSORS}
 
-    def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> Self:
+    def select(self, rows: Rows) -> Self:
         """Return some of the Gaussians, with all their tensors and extra columns.
 
+        ``scene[rows]`` does the same.
+
         Args:
-            rows: Row numbers, of which negative ones count from the end, or a mask.
+            rows: A slice, row numbers, of which negative ones count from the end, or a mask.
 
         Returns:
             A scene with a copy of those rows.
 
         Raises:
             InvalidArgumentError: A mask has not one entry per Gaussian, a number is out of range
-                (which is checked on a CPU only), or ``rows`` are uint8.
+                (which is checked on a CPU only), or ``rows`` is a single number or uint8.
         """
-        rows = row_numbers(rows, len(self), things="Gaussians", device=self.device)
+        chosen = row_numbers(rows, len(self), things="Gaussians", device=self.device)
         return self.with_tensors(
-            {name: tensor.index_select(0, rows) for name, tensor in self.tensors().items()},
-            {name: column.index_select(0, rows) for name, column in self.extras.items()},
+            {name: tensor.index_select(0, chosen) for name, tensor in self.tensors().items()},
+            {name: column.index_select(0, chosen) for name, column in self.extras.items()},
         )
 
-    def __getitem__(self, rows: slice | Sequence[int] | NDArray[Any] | Tensor) -> Self:
-        """Return some of the Gaussians, as :meth:`select` does.
-
-        Args:
-            rows: A slice, a mask, or row numbers.
-
-        Returns:
-            A scene with a copy of those rows.
-
-        Raises:
-            InvalidArgumentError: As for :meth:`select`, or ``rows`` is a single number.
-        """
-        return self.select(rows)  # type: ignore[arg-type]
+    __getitem__ = select
 
     def save(
         self,
