@@ -11,7 +11,7 @@ import cvtgs
 from cvtgs import Simplifier
 from cvtgs.analysis import analyze
 from cvtgs.cli.main import main
-from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputError, OutputExistsError
 from cvtgs.evaluation.scorer import ImageScores, scene_scores
 from cvtgs.levels import LevelEntry, LevelsIndex, check_levels, level_names, write_levels
 from scenes import random_scene, same_bits
@@ -235,6 +235,21 @@ def test_boxes_of_levels_are_in_the_axes_of_their_files(tmp_path) -> None:
     stored = cvtgs.load(tmp_path / "rho_0.5.glb", axes="rdf").means  # the numbers in the file
     assert list(index.levels[0].box_min) == stored.amin(dim=0).tolist()
     assert list(index.levels[0].box_max) == stored.amax(dim=0).tolist()
+
+
+def test_the_old_index_goes_before_its_levels_are_replaced(tmp_path, monkeypatch) -> None:
+    levels = Simplifier(device="cpu").levels(random_scene(60), [0.5, 0.1])
+    write_levels(levels, tmp_path, rhos=[0.5, 0.1], source="a")
+
+    def save(scene, path, **options):
+        if len(scene) == 6:
+            raise OutputError("the disk is full.")
+        cvtgs.save(scene, path, **options)
+
+    monkeypatch.setattr("cvtgs.levels.save", save)
+    with pytest.raises(OutputError):
+        write_levels(levels, tmp_path, rhos=[0.5, 0.1], source="a", overwrite=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["rho_0.1.ply", "rho_0.5.ply"]
 
 
 def test_a_format_that_cannot_be_read_is_refused_in_capitals_too(tmp_path: Path) -> None:

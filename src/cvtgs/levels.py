@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
@@ -12,7 +13,7 @@ from cvtgs.config.base import Record
 from cvtgs.counts import target_count, written, written_ratios
 from cvtgs.errors import InvalidArgumentError, check_path
 from cvtgs.evaluation import Evaluation, SceneScores
-from cvtgs.io import check_output, check_save, load, save
+from cvtgs.io import check_output, check_save, load, save, scene_size
 from cvtgs.io.atomic import make_folder, write_atomically
 from cvtgs.io.axes import SCENE_AXES, checked_axes
 from cvtgs.report import Level, check_one_scene
@@ -123,7 +124,7 @@ def write_levels(
     axes: str | None = None,
     overwrite: bool = False,
 ) -> LevelsIndex:
-    """Write levels and, last, the index that names them.
+    """Write levels and, last, the index that names them; until then, there is none.
 
     Args:
         levels: The levels.
@@ -182,6 +183,9 @@ def write_levels(
                 f"{made.target_count:,} of {counted(made.input_count, 'Gaussian')}."
             )
     check_levels(place, names, overwrite=overwrite)
+    if overwrite:  # the old index would describe other files until the new one is written
+        with suppress(OSError):  # then it cannot be replaced either
+            (place / INDEX_NAME).unlink(missing_ok=True)
     entries = []
     for level, rho, name in zip(levels, ratios, names, strict=True):
         save(level.scene, place / name, overwrite=overwrite, axes=axes)
@@ -203,7 +207,7 @@ def _entry(level: Level, rho: float, path: Path) -> LevelEntry:
         file=path.name,
         rho=rho,
         count=len(stored),
-        bytes=path.stat().st_size,
+        bytes=scene_size(path),
         geometric_error=level.geometric_error,
         box_min=tuple(lowest.tolist()),
         box_max=tuple(highest.tolist()),

@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import shutil
 import signal
 import sys
 import threading
@@ -11,11 +12,13 @@ from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import current_process, get_context
+from pathlib import Path
+from tempfile import NamedTemporaryFile, TemporaryDirectory
 from types import TracebackType
 from typing import Protocol, Self, TypeVar, runtime_checkable
 
 from cvtgs.counts import checked_whole
-from cvtgs.errors import InvalidArgumentError, RunError
+from cvtgs.errors import InvalidArgumentError, OutputError, RunError, reason_of
 from cvtgs.startup import load_torch
 
 if sys.platform == "win32":
@@ -27,6 +30,13 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 WAKE_SECONDS = 0.5  # longest wait for a result at once: on Windows, Ctrl-C does not end a wait
+MOST_SENT = 256
+"""Largest result that is sent through the pipe of the pool, bytes; others are in temporary files.
+
+A pipe takes that much in one piece, so a process that ends never leaves a part of a result in it,
+for whose rest the pool would wait forever.
+"""
+
 MOST_ON_WINDOWS = 61  # largest number of processes that a pool of Python has on Windows
 
 
@@ -93,12 +103,17 @@ class LocalWorkers:
                 "a process of multiprocessing.Pool may not start others; use "
                 "concurrent.futures.ProcessPoolExecutor in its place, or no workers here."
             )
+        with _temporary_errors():
+            self._folder = TemporaryDirectory(prefix="cvtgs-", ignore_cleanup_errors=True)
         context = get_context("spawn")  # fork would copy locks that torch's threads hold
         self._watched, self._alive = context.Pipe(duplex=False)
         threads = max(1, core_count() // self._count)
         with _hangup_ignored():
             self._pool = ProcessPoolExecutor(
-                self._count, context, initializer=_begin, initargs=(self._watched, threads)
+                self._count,
+                context,
+                initializer=_begin,
+                initargs=(self._watched, threads, self._folder.name),
             )
             # They start while this process reads the sample.
             self._starts = [self._pool.submit(os.getpid) for _ in range(self._count)]
@@ -115,6 +130,7 @@ class LocalWorkers:
         self._alive.close()  # ends processes that still work
         self._pool.shutdown(cancel_futures=True)
         self._watched.close()
+        self._folder.cleanup()
 
     def __call__(
         self, function: Callable[[Item], Result], items: Sequence[Item]
@@ -131,17 +147,20 @@ class LocalWorkers:
         Raises:
             InvalidArgumentError: The workers were not started by ``with``.
             RunError: A process ended unexpectedly.
+            OutputError: There is no room for temporary files.
         """
         if not hasattr(self, "_pool"):
             raise InvalidArgumentError("workers run inside `with LocalWorkers(...) as workers:`.")
-        futures = deque[Future[bytes]]()
+        futures = deque[Future[bytes | str]]()
         try:
             for one in items:  # the pool refuses work if a process ended since the last call
-                futures.append(self._pool.submit(_call, pickle.dumps((function, one))))
+                work = pickle.dumps((function, one))
+                futures.append(self._pool.submit(_call, work, self._folder.name))
             while futures:  # drops results once yielded: a scan has dozens of megabytes
                 while not wait([futures[0]], WAKE_SECONDS).done:
                     pass
-                result: Result = pickle.loads(futures.popleft().result())
+                found = futures.popleft().result()
+                result: Result = pickle.loads(_taken(found) if isinstance(found, str) else found)
                 yield result
         except BrokenProcessPool as error:
             if all(start.done() and start.exception() for start in self._starts):
@@ -172,16 +191,39 @@ def _hangup_ignored() -> Iterator[None]:
         signal.signal(signal.SIGHUP, before)
 
 
-def _call(work: bytes) -> bytes:
-    """Call a pickled function; as objects, torch would pass tensors through files in a folder."""
+def _call(work: bytes, folder: str) -> bytes | str:
+    """Call a pickled function; return its pickled result, or the path of a file with it."""
     function, item = pickle.loads(work)  # made by the process that started this one
-    return pickle.dumps(function(item))
+    result = pickle.dumps(function(item))
+    if len(result) <= MOST_SENT:
+        return result
+    with _temporary_errors(), NamedTemporaryFile(dir=folder, delete=False) as file:
+        file.write(result)
+    return file.name
 
 
-def _begin(watched: Connection, threads: int) -> None:
+def _taken(path: str) -> bytes:
+    """Read and remove a temporary file."""
+    content = Path(path).read_bytes()
+    Path(path).unlink()
+    return content
+
+
+@contextmanager
+def _temporary_errors() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f"the folder of temporary files must be writable and have room for results of worker "
+            f"processes, found: {reason_of(error)}; TMPDIR sets another folder."
+        ) from error
+
+
+def _begin(watched: Connection, threads: int, folder: str) -> None:
     """Prepare a worker process: it leaves Ctrl-C to its parent, and ends when the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(watched,), daemon=True).start()
+    threading.Thread(target=_end_with, args=(watched, folder), daemon=True).start()
     os.environ["OMP_NUM_THREADS"] = str(threads)  # for searches and for libraries loaded later
     load_torch()
     import torch  # noqa: PLC0415 (with these settings)
@@ -189,8 +231,9 @@ def _begin(watched: Connection, threads: int) -> None:
     torch.set_num_threads(threads)  # the program of the parent may have loaded it
 
 
-def _end_with(watched: Connection) -> None:
+def _end_with(watched: Connection, folder: str) -> None:
     try:
         watched.recv_bytes()
     except (EOFError, OSError):
+        shutil.rmtree(folder, ignore_errors=True)  # the parent may have been killed
         os._exit(1)

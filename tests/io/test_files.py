@@ -73,9 +73,10 @@ def test_a_directory_without_a_scene_is_refused(tmp_path: Path, name: str) -> No
 def test_a_pipe_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "pipe.ply"
     os.mkfifo(path)
-    with pytest.raises(InputError) as caught:
-        load(path)
-    assert str(caught.value) == f"{path}: must be a regular file, found a device or a pipe."
+    for read in (load, scene_size):
+        with pytest.raises(InputError) as caught:
+            read(path)
+        assert str(caught.value) == f"{path}: must be a regular file, found a device or a pipe."
 
 
 def test_an_unreadable_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

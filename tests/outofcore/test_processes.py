@@ -3,12 +3,16 @@
 import math
 import multiprocessing
 import os
+import pickle
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
+from concurrent.futures.process import _ResultItem
 from functools import partial
+from multiprocessing.reduction import ForkingPickler
 from unittest.mock import MagicMock
 
 import psutil
@@ -17,9 +21,10 @@ import pytest
 import cvtgs
 from cvtgs.cli.main import main
 from cvtgs.devices import core_count
-from cvtgs.errors import InvalidArgumentError, InvalidSceneError, RunError
+from cvtgs.errors import InvalidArgumentError, InvalidSceneError, OutputError, RunError
 from cvtgs.outofcore import LocalWorkers, simplify_file
 from cvtgs.outofcore.memory import ROOMY_BYTES, worker_count
+from cvtgs.processes import MOST_SENT, _call
 from process_cases import die, numbered, refuse, wait
 
 pytestmark = pytest.mark.slow  # every process loads torch
@@ -77,6 +82,32 @@ def test_errors_of_workers_reach_the_caller(workers):
     with pytest.raises(InvalidSceneError, match="0: found none"):
         list(workers(refuse, range(3)))
     assert [number for number, _, _ in workers(numbered, [7])] == [7]
+
+
+def test_large_results_come_through_files_that_are_removed(workers, tmp_path, monkeypatch):
+    assert list(workers(bytes, [10, 3_000_000])) == [bytes(10), bytes(3_000_000)]
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with LocalWorkers(1) as found:
+        (folder,) = tmp_path.iterdir()
+        assert list(found(bytes, [3_000_000])) == [bytes(3_000_000)]
+        assert list(folder.iterdir()) == []
+        results = found(bytes, [3_000_000, 5_000_000])  # one of them is never taken
+        next(results)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("size", [0, MOST_SENT - 100, MOST_SENT, 10**6])
+def test_a_process_never_leaves_a_part_of_a_result_in_the_pipe(size, tmp_path):
+    """A pipe takes up to PIPE_BUF bytes as a whole; for the rest of more, the pool would wait."""
+    found = _call(pickle.dumps((bytes, size)), str(tmp_path))
+    message = ForkingPickler.dumps(_ResultItem(10**9, result=found))
+    assert len(message) + 4 <= 512  # the least PIPE_BUF; the pool adds the length
+    assert bool(list(tmp_path.iterdir())) == (size > MOST_SENT - 50)
+
+
+def test_no_room_for_a_result_is_one_sentence(tmp_path):
+    with pytest.raises(OutputError, match="must be writable and have room for results of worker"):
+        _call(pickle.dumps((bytes, 10**6)), str(tmp_path / "missing"))
 
 
 def test_a_worker_that_dies_is_an_error():

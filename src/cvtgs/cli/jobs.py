@@ -1,6 +1,7 @@
 """Scenes that a command reads and writes: one, many into a directory, or standard streams."""
 
 import argparse
+import gc
 import glob
 import os
 import sys
@@ -18,8 +19,8 @@ from cvtgs.cli.display import (
     say_wrapped,
     send_file,
 )
-from cvtgs.cli.options import READABLE, WRITABLE, CommandParser, dotted, is_same_file
-from cvtgs.cli.paths import folder_or_file, names_file
+from cvtgs.cli.options import READABLE, WRITABLE, CommandParser, dotted
+from cvtgs.cli.paths import folder_or_file, is_same_file, names_file
 from cvtgs.errors import (
     CvtgsError,
     InputError,
@@ -43,9 +44,9 @@ class Outcome(NamedTuple):
     seconds: str = ""
     notes: Sequence[str] = ()
 
-    def facts(self, before: int, after: int) -> str:
-        """Return counts, bytes and seconds in one line."""
-        sizes = f"{size_text(before)} -> {size_text(after)}"
+    def facts(self, before: int, after: int | None) -> str:
+        """Return counts, bytes and seconds in one line; None if the output was moved away."""
+        sizes = f"{size_text(before)} -> {'moved away' if after is None else size_text(after)}"
         return ", ".join(filter(None, (self.counts, sizes, self.seconds)))
 
 
@@ -194,16 +195,20 @@ def run_jobs(
     for number, job in enumerate(jobs, start=1):
         source, target = job.options.input, job.options.output
         place = f"[{number:>{len(str(len(jobs)))}}/{len(jobs)}] "
+        outcome = None
         try:
             bytes_in = cvtgs.io.scene_size(source)
             outcome = work(job)
         except CvtgsError as error:
             failures += 1
             failed(job, error)
-            say(printable_name(f"cvtgs: error: {place}{error}"), file=sys.stderr)
+            name = "" if str(source) in str(error) else f"{source}: "
+            say(printable_name(f"cvtgs: error: {place}{name}{error}"), file=sys.stderr)
+        if outcome is None:
+            gc.collect()  # the error and its frames refer to each other, and hold the scene
             continue
-        bytes_out = cvtgs.io.scene_size(target)
-        before, after = before + bytes_in, after + bytes_out
+        bytes_out = _size_of_output(target)
+        before, after = before + bytes_in, after + (bytes_out or 0)
         if not quiet:
             facts = outcome.facts(bytes_in, bytes_out)
             room = max(8, WIDTH - len(place) - len(facts) - 2)
@@ -225,7 +230,7 @@ def _run_one(job: SceneJob, work: Callable[[SceneJob], Outcome]) -> None:
     options = job.options
     before = cvtgs.io.scene_size(options.input)
     outcome = work(job)
-    facts = outcome.facts(before, cvtgs.io.scene_size(options.output))
+    facts = outcome.facts(before, _size_of_output(options.output))
     stream, name = sys.stdout, printable_name(str(options.output))
     if job.to_stream:
         stream, name = sys.stderr, STANDARD_OUTPUT
@@ -239,6 +244,14 @@ def _run_one(job: SceneJob, work: Callable[[SceneJob], Outcome]) -> None:
         say(name, file=stream)
     else:
         say(f"{name}: {facts}", file=stream)
+
+
+def _size_of_output(path: Path) -> int | None:
+    """Return the bytes of a scene that was written; None if another program has moved it since."""
+    try:
+        return cvtgs.io.scene_size(path)
+    except InputError:
+        return None
 
 
 def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
@@ -301,6 +314,11 @@ def _in_folder(folder: str) -> list[str]:
 
     if not os.path.isdir(folder) or _is_scene(folder):  # noqa: PTH112 (any path)
         return [folder]
+    if os.path.isfile(f"{folder}/tileset.json"):  # noqa: PTH113 (any path)
+        raise InputError(
+            f"{folder}: must be a scene or a folder of scenes, found 3D Tiles (tileset.json), "
+            "whose files are parts of a scene; cvtgs only writes them."
+        )
     found = sorted(glob.glob(f"{glob.escape(folder)}/*"))  # noqa: PTH207 (as text)
     scenes = [
         path

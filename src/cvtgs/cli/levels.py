@@ -21,12 +21,12 @@ from cvtgs.cli.options import (
     add_options,
     checkpoint_of,
     dotted,
-    is_same_file,
     preset_of,
     ratios,
     read_axes,
     read_settings,
 )
+from cvtgs.cli.paths import is_same_file
 from cvtgs.cli.streams import add_stream_options, check_stream_options, stream_blocks, stream_levels
 from cvtgs.cli.view import check_page, write_page
 from cvtgs.errors import InvalidArgumentError

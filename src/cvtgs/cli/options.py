@@ -2,13 +2,11 @@
 
 import argparse
 import math
-import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import pairwise, takewhile
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import cvtgs
@@ -280,8 +278,8 @@ def read_numbers(text: str, counts: Sequence[int], *, name: str, meaning: str) -
 
 
 def dotted(text: str) -> str:
-    """Read ``--suffix``, for argparse: spz means .spz."""
-    return text if text.startswith(".") else f".{text}"
+    """Read ``--suffix``, for argparse: spz means .spz, and _small.ply itself."""
+    return f".{text}" if text[:1].isalnum() else text
 
 
 class FileAxes(NamedTuple):
@@ -369,32 +367,3 @@ def read_scene(
     )
     cvtgs.validity.warn_of_lost_digits(scene)
     return scene if kept is None else scene.with_sh_degree(kept)
-
-
-def check_written_files(options: argparse.Namespace) -> None:
-    """Raise if OUT or the report would overwrite each other or an input.
-
-    Only OUT may replace IN, which is read before OUT is written.
-    """
-    taken = {
-        f"--{name}": Path(value)
-        for name in ("config", "cameras", "keep", "ckpt")
-        if (value := getattr(options, name)) not in (None, "auto", "none")
-    }
-    for name, path in (("OUT", options.output), ("--report", options.report)):
-        for other, file in taken.items():
-            if path is not None and is_same_file(path, file):
-                raise InvalidArgumentError(
-                    f"{name} and {other} must be different files, found {path} for both."
-                )
-        taken |= {"IN": cvtgs.io.scene_file(options.input), "OUT": options.output}
-
-
-def is_same_file(path: Path, other: Path) -> bool:
-    """Return whether two paths lead to one file."""
-    if os.path.realpath(path) == os.path.realpath(other):
-        return True
-    try:
-        return path.samefile(other)  # a link, or another spelling on a case-insensitive file system
-    except (OSError, ValueError):
-        return False

@@ -1,8 +1,11 @@
-"""Types of paths for argparse: files to read, and files and folders to write."""
+"""Paths of commands: types for argparse, and checks that outputs replace no input."""
 
 import argparse
 import os
 from pathlib import Path
+
+import cvtgs
+from cvtgs.errors import InputError, InvalidArgumentError
 
 _SCENES = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf", ".usda")
 
@@ -49,3 +52,40 @@ def names_file(path: Path) -> bool:
     """Return whether a path is no folder and ends like a file that commands read or write."""
     is_folder = os.path.isdir(path)  # noqa: PTH112 (false for impossible names)
     return path.name.lower().endswith(FILE_SUFFIXES) and not is_folder
+
+
+def check_written_files(options: argparse.Namespace) -> None:
+    """Raise if OUT or the report would overwrite each other or an input.
+
+    Only OUT may replace IN, which is read before OUT is written.
+    """
+    taken = {
+        f"--{name}": Path(value)
+        for name in ("config", "cameras", "keep", "ckpt")
+        if (value := getattr(options, name)) not in (None, "auto", "none")
+    }
+    for name, path in (("OUT", options.output), ("--report", options.report)):
+        for other, file in taken.items():
+            if path is not None and is_same_file(path, file):
+                raise InvalidArgumentError(
+                    f"{name} and {other} must be different files, found {path} for both."
+                )
+        taken |= {"IN": _found_file(options.input), "OUT": options.output}
+
+
+def _found_file(scene: Path) -> Path:
+    """Return the file of a scene, or its path if there is none, which is an error later."""
+    try:
+        return cvtgs.io.scene_file(scene)
+    except InputError:
+        return scene
+
+
+def is_same_file(path: Path, other: Path) -> bool:
+    """Return whether two paths lead to one file."""
+    if os.path.realpath(path) == os.path.realpath(other):
+        return True
+    try:
+        return path.samefile(other)  # a link, or another spelling on a case-insensitive file system
+    except (OSError, ValueError):
+        return False

@@ -3,7 +3,7 @@
 import argparse
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import cvtgs
@@ -59,7 +59,7 @@ class ReportFile:
 def report_file(options: argparse.Namespace) -> Iterator[ReportFile]:
     """Check that the file can be written; at the end, write the entries of many scenes.
 
-    They are written even if some of the scenes failed.
+    They are written even if some of the scenes failed, or the command is interrupted.
     """
     if options.report is not None:
         cvtgs.io.check_output(options.report, overwrite=options.overwrite)
@@ -68,5 +68,9 @@ def report_file(options: argparse.Namespace) -> Iterator[ReportFile]:
         yield file
     except RunError:
         file.write_all()
+        raise
+    except BaseException:
+        with suppress(OutputError, OutputExistsError):  # one error is enough
+            file.write_all()
         raise
     file.write_all()

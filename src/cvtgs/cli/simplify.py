@@ -24,7 +24,6 @@ from cvtgs.cli.options import (
     CAMERA_FILES,
     AddParser,
     add_options,
-    check_written_files,
     checkpoint_of,
     count,
     preset_of,
@@ -34,7 +33,7 @@ from cvtgs.cli.options import (
     read_settings,
     seconds,
 )
-from cvtgs.cli.paths import any_path, new_file
+from cvtgs.cli.paths import any_path, check_written_files, new_file
 from cvtgs.cli.reports import report_file
 from cvtgs.errors import (
     ConfigError,

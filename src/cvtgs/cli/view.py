@@ -9,14 +9,8 @@ from typing import TYPE_CHECKING
 import cvtgs
 from cvtgs.cli.display import say
 from cvtgs.cli.jobs import expanded
-from cvtgs.cli.options import (
-    PRESET_NAMES,
-    AddParser,
-    add_options,
-    is_same_file,
-    ratio,
-)
-from cvtgs.cli.paths import any_path, new_file
+from cvtgs.cli.options import PRESET_NAMES, AddParser, add_options, ratio
+from cvtgs.cli.paths import any_path, is_same_file, new_file
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import write_atomically
 from cvtgs.text import printable_name

@@ -52,8 +52,7 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
             name = shown(str(path))
             raise InputNotFoundError(f"{name}: must have the name of a file: {error}.") from error
         if not stat.S_ISREG(mode):  # opening a pipe would wait for ever
-            kind = "directory" if stat.S_ISDIR(mode) else "device or a pipe"
-            raise InputError(f"{path}: must be a regular file, found a {kind}.")
+            raise _not_regular(path)
         with path.open("rb") as file:
             if file.peek(len(_POINTER)).startswith(_POINTER):
                 raise FileFormatError(
@@ -61,6 +60,11 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
                     "file with: git lfs pull."
                 )
             yield file
+
+
+def _not_regular(path: Path) -> InputError:
+    kind = "directory" if is_folder(path) else "device or a pipe"
+    return InputError(f"{path}: must be a regular file, found a {kind}.")
 
 
 def is_file(path: Path) -> bool:
@@ -139,7 +143,7 @@ def scene_size(path: str | os.PathLike[str]) -> int:
     parts = [part for pattern in patterns for part in file.parent.glob(pattern)]
     with input_errors(file):
         if not is_file(file):  # also a name that no file can have
-            raise FileNotFoundError
+            raise _not_regular(file) if os.path.exists(file) else FileNotFoundError  # noqa: PTH110
         return sum(part.stat().st_size for part in (file, *parts))
 
 

@@ -67,7 +67,7 @@ def allocate(job: Job) -> None:
     regions = _regions(cell_counts, job.cell_room)
     if len(regions) > 1:
         warn(
-            f"{sum(cell_counts)} cells do not fit into memory together, so merge costs are only "
+            f"{sum(cell_counts):,} cells do not fit into memory together, so merge costs are only "
             f"compared within {len(regions)} parts of the scene; raise --memory if possible.",
         )
     sizes = [sum(cell_counts[block] for block in region) for region in regions]

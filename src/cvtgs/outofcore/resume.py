@@ -11,6 +11,7 @@ from pathlib import Path
 from cvtgs.clock import StageClock
 from cvtgs.config.base import Record
 from cvtgs.errors import InputError, OutputError, warn
+from cvtgs.io.files import is_file, is_folder
 from cvtgs.io.locks import hidden_path, lock_path, output_lock
 from cvtgs.mergenet import Checkpoint, encode_checkpoint
 from cvtgs.outofcore.job import Job
@@ -114,7 +115,7 @@ def remove_job_files(output: str | os.PathLike[str], *, is_stream: bool = False)
     """Remove the files that interrupted runs of an output left, unless another run uses them."""
     folder = hidden_path(output, "blocks")
     locked = folder if is_stream else output  # commands lock the output of a stream
-    if folder.is_dir() or lock_path(locked).exists():
+    if is_folder(folder) or is_file(lock_path(locked)):
         with suppress(OutputError), output_lock(locked):
             shutil.rmtree(folder, ignore_errors=True)
 
