@@ -18,6 +18,17 @@ def refuse(number: int) -> None:
     raise InvalidSceneError(f"{number}: found none.")
 
 
+class TwoWordsError(Exception):
+    """An error that cannot be unpickled, since it keeps one of two arguments."""
+
+    def __init__(self, one: str, other: str) -> None:
+        super().__init__(one)
+
+
+def fail(number: int) -> None:
+    raise TwoWordsError("no", "way")
+
+
 def die(number: int) -> None:
     os._exit(9)
 

@@ -6,6 +6,7 @@ import shutil
 import signal
 import sys
 import threading
+import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
@@ -13,9 +14,9 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import current_process, get_context
 from pathlib import Path
-from tempfile import NamedTemporaryFile, TemporaryDirectory
+from tempfile import NamedTemporaryFile, mkdtemp
 from types import TracebackType
-from typing import Protocol, Self, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, Self, TypeVar, runtime_checkable
 
 from cvtgs.counts import checked_whole
 from cvtgs.errors import InvalidArgumentError, OutputError, RunError, reason_of
@@ -103,20 +104,21 @@ class LocalWorkers:
                 "a process of multiprocessing.Pool may not start others; use "
                 "concurrent.futures.ProcessPoolExecutor in its place, or no workers here."
             )
+        self._owner = os.getpid()
         with _temporary_errors():
-            self._folder = TemporaryDirectory(prefix="cvtgs-", ignore_cleanup_errors=True)
+            self._folder = mkdtemp(prefix="cvtgs-")
         context = get_context("spawn")  # fork would copy locks that torch's threads hold
         self._watched, self._alive = context.Pipe(duplex=False)
         threads = max(1, core_count() // self._count)
+        settings = (self._watched, threads, self._folder)
         with _hangup_ignored():
             self._pool = ProcessPoolExecutor(
-                self._count,
-                context,
-                initializer=_begin,
-                initargs=(self._watched, threads, self._folder.name),
+                self._count, context, initializer=_begin, initargs=settings
             )
-            # They start while this process reads the sample.
-            self._starts = [self._pool.submit(os.getpid) for _ in range(self._count)]
+            with _interrupts_held():
+                # They start while this process reads the sample.
+                self._starts = [self._pool.submit(os.getpid) for _ in range(self._count)]
+        self._processes = [*(self._pool._processes or {}).values()]
         return self
 
     def __exit__(
@@ -125,12 +127,19 @@ class LocalWorkers:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if kind is None:
-            self._pool.shutdown()
-        self._alive.close()  # ends processes that still work
-        self._pool.shutdown(cancel_futures=True)
-        self._watched.close()
-        self._folder.cleanup()
+        is_own = os.getpid() == self._owner  # not in a process that a program has forked meanwhile
+        try:
+            if kind is None and is_own:
+                self._pool.shutdown()
+            self._alive.close()  # ends processes that still work
+            if is_own:
+                for process in self._processes:
+                    process.terminate()  # also while it starts
+                self._pool.shutdown(cancel_futures=True)
+        finally:
+            self._watched.close()
+            if is_own:
+                shutil.rmtree(self._folder, ignore_errors=True)
 
     def __call__(
         self, function: Callable[[Item], Result], items: Sequence[Item]
@@ -155,15 +164,18 @@ class LocalWorkers:
         try:
             for one in items:  # the pool refuses work if a process ended since the last call
                 work = pickle.dumps((function, one))
-                futures.append(self._pool.submit(_call, work, self._folder.name))
+                futures.append(self._pool.submit(_call, work, self._folder))
             while futures:  # drops results once yielded: a scan has dozens of megabytes
                 while not wait([futures[0]], WAKE_SECONDS).done:
                     pass
                 found = futures.popleft().result()
-                result: Result = pickle.loads(_taken(found) if isinstance(found, str) else found)
+                answer = pickle.loads(_taken(found) if isinstance(found, str) else found)
+                if answer.error is not None:
+                    raise answer.error
+                result: Result = answer.result
                 yield result
         except BrokenProcessPool as error:
-            if all(start.done() and start.exception() for start in self._starts):
+            if self._could_not_start():
                 raise RunError(
                     "no worker process could start; a script that starts some must be a file, and "
                     'guard its main code with `if __name__ == "__main__":`.'
@@ -175,6 +187,29 @@ class LocalWorkers:
         finally:
             for future in futures:
                 future.cancel()
+
+    def _could_not_start(self) -> bool:
+        """Return whether no process did any work, and one ended by an error, not by a signal."""
+        for process in self._processes:
+            process.join(WAKE_SECONDS)
+        is_failed = all(start.done() and start.exception() for start in self._starts)
+        return is_failed and any(process.exitcode == 1 for process in self._processes)
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Start processes that Ctrl-C does not reach; this one gets it at the end of the context.
+
+    The pool must have been made before: Python ends the hold when it starts a process of its own.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
@@ -191,15 +226,37 @@ def _hangup_ignored() -> Iterator[None]:
         signal.signal(signal.SIGHUP, before)
 
 
+class _Answer(NamedTuple):
+    """What a call returned or raised."""
+
+    result: Any = None
+    error: Exception | None = None
+
+
 def _call(work: bytes, folder: str) -> bytes | str:
-    """Call a pickled function; return its pickled result, or the path of a file with it."""
-    function, item = pickle.loads(work)  # made by the process that started this one
-    result = pickle.dumps(function(item))
-    if len(result) <= MOST_SENT:
-        return result
+    """Call a pickled function; return its pickled answer, or the path of a file with it."""
+    try:
+        function, item = pickle.loads(work)  # made by the process that started this one
+        answer = pickle.dumps(_Answer(function(item)))
+    except Exception as error:
+        answer = _pickled_error(error)
+    if len(answer) <= MOST_SENT:
+        return answer
     with _temporary_errors(), NamedTemporaryFile(dir=folder, delete=False) as file:
-        file.write(result)
+        file.write(answer)
     return file.name
+
+
+def _pickled_error(error: Exception) -> bytes:
+    """Pickle an error and its traceback; one that cannot be pickled becomes a RunError."""
+    error.add_note(f"In a worker process:\n{traceback.format_exc()}")
+    try:
+        content = pickle.dumps(_Answer(error=error))
+        pickle.loads(content)
+    except Exception:
+        kind = type(error).__name__
+        content = pickle.dumps(_Answer(error=RunError(f"a worker process failed: {kind}: {error}")))
+    return content
 
 
 def _taken(path: str) -> bytes:

@@ -25,7 +25,7 @@ from cvtgs.errors import InvalidArgumentError, InvalidSceneError, OutputError, R
 from cvtgs.outofcore import LocalWorkers, simplify_file
 from cvtgs.outofcore.memory import ROOMY_BYTES, worker_count
 from cvtgs.processes import MOST_SENT, _call
-from process_cases import die, numbered, refuse, wait
+from process_cases import die, fail, numbered, refuse, wait
 
 pytestmark = pytest.mark.slow  # every process loads torch
 
@@ -81,7 +81,17 @@ def test_no_wait_for_a_result_is_longer_than_a_second(workers, monkeypatch):
 def test_errors_of_workers_reach_the_caller(workers):
     with pytest.raises(InvalidSceneError, match="0: found none"):
         list(workers(refuse, range(3)))
+    with pytest.raises(RunError, match="a worker process failed: TwoWordsError: no"):
+        list(workers(fail, range(3)))
     assert [number for number, _, _ in workers(numbered, [7])] == [7]
+
+
+def test_errors_of_workers_say_where_they_were_raised(workers):
+    with pytest.raises(InvalidSceneError) as caught:
+        list(workers(refuse, range(3)))
+    (note,) = caught.value.__notes__
+    assert note.startswith("In a worker process:\nTraceback")
+    assert "in refuse" in note
 
 
 def test_large_results_come_through_files_that_are_removed(workers, tmp_path, monkeypatch):
@@ -115,6 +125,45 @@ def test_a_worker_that_dies_is_an_error():
         for _ in range(2):  # the second call finds the process gone
             with pytest.raises(RunError, match="most likely for lack of memory"):
                 list(found(die, range(2)))
+
+
+@on_posix
+def test_a_worker_killed_while_it_starts_is_not_a_missing_guard():
+    with LocalWorkers(2) as found:
+        found._processes[0].kill()
+        with pytest.raises(RunError, match="most likely for lack of memory"):
+            list(found(numbered, range(2)))
+
+
+STARTING = """
+import time
+import torch  # every worker does the same, before it can ignore Ctrl-C itself
+from cvtgs.outofcore import LocalWorkers
+if __name__ == "__main__":
+    try:
+        with LocalWorkers(2):
+            print("started", flush=True)
+            time.sleep(60)
+    except KeyboardInterrupt:
+        print("ended")
+"""
+
+
+@on_posix
+def test_an_interrupt_does_not_reach_starting_workers(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(STARTING, encoding="utf-8")
+    running = subprocess.Popen(
+        [sys.executable, script],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert running.stdout.readline() == "started\n"
+    time.sleep(0.3)
+    os.killpg(running.pid, signal.SIGINT)  # as a terminal does
+    assert running.communicate(timeout=60) == ("ended\n", "")
 
 
 @on_posix
