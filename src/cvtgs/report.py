@@ -59,7 +59,8 @@ class MatchReport(Record):
     Attributes:
         views: Number of images of the full scene.
         heldout: Number of those that decided and score: every eighth, or all if there are fewer
-            than eight. Blocks have their own images.
+            than eight. Of blocks, both are sums, although they may share views, and PSNR are means
+            over blocks, in whose images the other blocks do not change.
         opacities_kept: Whether the matched opacities were kept, because they lowered the error of
             the held-out images.
         psnr_before: PSNR of the mean squared error of the held-out images before matching, dB.

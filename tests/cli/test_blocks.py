@@ -112,8 +112,27 @@ def test_images_leave_less_memory_for_one_piece(
         memory="2GB",
         workers=1,
         scheduler=None,
+        time_budget=None,
         device="auto",
     )
     for preset in ("standard", "matched"):
         assert block_memory(options, cvtgs.SimplifyConfig(preset=preset)) is None
-    assert rooms == [2_000_000_000, 2_000_000_000 - IMAGE_BYTES]
+    options.time_budget = 60.0  # may choose a preset with images
+    assert block_memory(options, cvtgs.SimplifyConfig()) is None
+    less = 2_000_000_000 - IMAGE_BYTES
+    assert rooms == [2_000_000_000, less, less]
+
+
+def test_images_leave_less_memory_for_a_stream_in_one_piece(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fitting = 2_000_000_000 - IMAGE_BYTES
+    monkeypatch.setattr(
+        "cvtgs.outofcore.memory.block_count",
+        lambda rows, memory, *, merging: 4 if memory <= fitting else 1,
+    )
+    cvtgs.save(random_scene(300), tmp_path / "in.ply")
+    words = ["levels", str(tmp_path / "in.ply"), "-o", str(tmp_path / "out"), "--stream", "sog"]
+    words += ["--preset", "matched", "--memory", "2GB", "--rho", "0.1"]
+    assert main(words) == 1
+    assert "streams in blocks need a preset without images" in capsys.readouterr().err

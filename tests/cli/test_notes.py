@@ -108,10 +108,15 @@ def test_a_target_out_of_reach_of_the_format_says_so(capsys, source):
 
 
 @pytest.mark.parametrize(
-    ("views", "heldout", "where"),
-    [(4, 4, "the same images"), (8, 1, "1 held-out image"), (32, 4, "4 held-out images")],
+    ("views", "heldout", "blocks", "where"),
+    [
+        (4, 4, 1, ": +0.50 dB on the same images."),
+        (8, 1, 1, ": +0.50 dB on 1 held-out image."),
+        (32, 4, 1, ": +0.50 dB on 4 held-out images."),
+        (13, 6, 2, " in all blocks together: +0.50 dB on average."),  # 8 and 5: 1 and all
+    ],
 )
-def test_the_images_that_a_matching_is_scored_on_are_named(views, heldout, where):
+def test_the_images_that_a_matching_is_scored_on_are_named(views, heldout, blocks, where):
     matched = MatchReport(
         views=views,
         heldout=heldout,
@@ -126,10 +131,10 @@ def test_the_images_that_a_matching_is_scored_on_are_named(views, heldout, where
         target_count=1,
         rho=0.1,
         matching=matched,
+        blocks=blocks,
         config=cvtgs.SimplifyConfig(),
     )
-    text = f"Matched to {views} images of the scene: +0.50 dB on {where}."
-    assert text in report_notes(report)
+    assert f"Matched to {views} images of the scene{where}" in report_notes(report)
 
 
 def test_settings_that_are_not_used_are_mentioned(capsys, source):

@@ -134,14 +134,17 @@ def report_notes(report: "SimplifyReport") -> list[str]:
         notes.append(shortfall_note(report))
     if report.config.uses_images and report.views == "none":
         notes.append("No images were rendered, since no Gaussians had to merge.")
+    together = " in all blocks together" * (report.blocks > 1)
     if report.matching is not None:
         matched = report.matching
-        where = counted(matched.heldout, "held-out image")
+        where = f"on {counted(matched.heldout, 'held-out image')}"
         if matched.heldout == matched.views:
-            where = "the same images"
+            where = "on the same images"
+        if report.blocks > 1:  # some may have held images out and others not
+            where = "on average"
         notes.append(
-            f"Matched to {counted(matched.views, 'image')} of the scene: "
-            f"{matched.psnr_after - matched.psnr_before:+.2f} dB on {where}."
+            f"Matched to {counted(matched.views, 'image')} of the scene{together}: "
+            f"{matched.psnr_after - matched.psnr_before:+.2f} dB {where}."
         )
     if report.refinement is not None:
         refined = report.refinement
@@ -154,6 +157,11 @@ def report_notes(report: "SimplifyReport") -> list[str]:
             )
         elif refined.gain == 0.0 and refined.stopped != "perfect":
             notes.append(f"Not refined: none of {steps} improved the held-out images.")
+        elif refined.steps == 0:
+            notes.append("Not refined: the held-out images were perfect from the start.")
         else:
-            notes.append(f"Refined in {steps}: {refined.gain:+.2f} dB on held-out images.")
+            average = " on average" * (report.blocks > 1)
+            notes.append(
+                f"Refined in {steps}{together}: {refined.gain:+.2f} dB on held-out images{average}."
+            )
     return notes

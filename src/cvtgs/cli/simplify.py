@@ -339,7 +339,7 @@ def _needs_blocks(options: argparse.Namespace, memory: int, config: "SimplifyCon
     from cvtgs.grouping import finer_count
     from cvtgs.outofcore.memory import IMAGE_BYTES, block_count
 
-    if config.uses_images:
+    if config.uses_images or options.time_budget is not None:  # it may choose a preset with images
         memory -= IMAGE_BYTES
     rows = _rows_of(options.input)
     if rows is None:

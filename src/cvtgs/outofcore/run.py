@@ -213,7 +213,7 @@ def check_config(config: SimplifyConfig, *, with_images: bool = True) -> None:
     """
     if not with_images and config.uses_images:
         raise ConfigError(
-            "blocks need a preset that uses no images of the scene (draft, fast, standard, "
+            "streams in blocks need a preset without images of the scene (draft, fast, standard, "
             f"paper) and no refinement; found {config.preset!r} with {config.visibility.views} "
             f"views and {config.refine.steps} steps of refinement."
         )
@@ -353,7 +353,8 @@ def report_blocks(
         if left:
             warn(
                 f"{left} of {len(reports)} blocks are shown by fewer than {LEAST_CAMERAS} cameras, "
-                f"so they were not matched to images or refined."
+                f"so they were not matched to images or refined; what no camera shows has fewer "
+                f"Gaussians than with presets without images."
             )
     matchings = [report.matching for report in reports if report.matching is not None]
     refinements = [report.refinement for report in reports if report.refinement is not None]
