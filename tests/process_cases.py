@@ -7,7 +7,7 @@ import time
 
 import torch
 
-from cvtgs.errors import InvalidSceneError
+from cvtgs.errors import InputError, InvalidSceneError
 
 
 def numbered(number: int) -> tuple[int, int, int]:
@@ -27,6 +27,10 @@ class TwoWordsError(Exception):
 
 def fail(number: int) -> None:
     raise TwoWordsError("no", "way")
+
+
+def miss(number: int) -> None:
+    raise InputError(f"{number}: none.").about("a.ply", 2)
 
 
 def die(number: int) -> None:

@@ -89,7 +89,8 @@ def test_on_an_address_of_the_network_any_page_may_connect(library: Library) -> 
 def test_a_named_machine_may_also_be_opened_by_its_address(
     library: Library, host: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cvtgs.viewer.connection._address_of", lambda name: "127.0.0.2")
+    found = ("127.0.0.2", 8080)
+    monkeypatch.setattr("cvtgs.viewer.connection._open_address", lambda *words: found)
     start_server("My-Machine", 8080)
     assert answer(library, {"Host": host, "Origin": f"http://{host}"}) == OWN
 

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import socket
+import sys
 import threading
 import time
 from pathlib import Path
@@ -10,7 +12,7 @@ from typing import Any
 import pytest
 
 import viser_stand_in
-from cvtgs.errors import RunError
+from cvtgs.errors import InvalidArgumentError, RunError
 from cvtgs.viewer import SceneViewer, ViewerServer
 from scenes import random_scene
 
@@ -97,3 +99,45 @@ def test_a_scene_is_not_saved_through_a_link(
     server.close()
     assert (start / "inside.ply").is_file()
     assert not list(outside.iterdir())
+
+
+def test_a_name_that_leads_nowhere_is_a_sentence_on_the_page(viewer: SceneViewer) -> None:
+    server = ViewerServer(viewer)
+    server.finish()
+    controls = viser_stand_in.ViserServer.latest.gui.controls
+    controls["file"].value = "a\0.ply"
+    controls["Save this scene"].call()
+    server.close()
+    assert "must be a path to write to" in controls["markdown 7"].content
+
+
+def test_an_unexpected_error_ends_no_thread_if_stderr_is_closed(
+    viewer: SceneViewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Closed:
+        def write(self, text: str) -> None:
+            raise BrokenPipeError
+
+    def simplify(preset: str, rho: float) -> Any:
+        raise TypeError("unexpected")
+
+    monkeypatch.setattr(viewer, "simplify", simplify)
+    monkeypatch.setattr(sys, "stderr", Closed())
+    server = ViewerServer(viewer)
+    with pytest.raises(TypeError):
+        server.finish()
+    assert threading.active_count() > 1
+    server.close()
+
+
+def test_a_server_takes_the_first_free_port_or_none(
+    viewer: SceneViewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        server = ViewerServer(viewer, host="127.0.0.1", port=port)
+        server.close()
+        assert viser_stand_in.ViserServer.latest.port > port
+        monkeypatch.setattr("cvtgs.viewer.connection._LAST_PORT", port)
+        with pytest.raises(InvalidArgumentError, match=f"a port from {port} to {port} must be fr"):
+            ViewerServer(viewer, host="127.0.0.1", port=port)

@@ -11,8 +11,9 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from multiprocessing import current_process, get_context
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from tempfile import NamedTemporaryFile, mkdtemp
 from types import TracebackType
@@ -105,20 +106,23 @@ class LocalWorkers:
                 "concurrent.futures.ProcessPoolExecutor in its place, or no workers here."
             )
         self._owner = os.getpid()
-        with _temporary_errors():
-            self._folder = mkdtemp(prefix="cvtgs-")
         context = get_context("spawn")  # fork would copy locks that torch's threads hold
-        self._watched, self._alive = context.Pipe(duplex=False)
         threads = max(1, core_count() // self._count)
-        settings = (self._watched, threads, self._folder)
-        with _hangup_ignored():
-            self._pool = ProcessPoolExecutor(
-                self._count, context, initializer=_begin, initargs=settings
-            )
-            with _interrupts_held():
-                # They start while this process reads the sample.
-                self._starts = [self._pool.submit(os.getpid) for _ in range(self._count)]
-        self._processes = [*(self._pool._processes or {}).values()]
+        with ExitStack() as stack:
+            with _temporary_errors():
+                self._folder = mkdtemp(prefix="cvtgs-")
+            stack.callback(shutil.rmtree, self._folder, ignore_errors=True)
+            self._watched, self._alive = context.Pipe(duplex=False)
+            stack.callback(self._watched.close)
+            settings = (self._watched, threads, self._folder)
+            with _hangup_ignored():
+                self._pool = ProcessPoolExecutor(
+                    self._count, context, initializer=_begin, initargs=settings
+                )
+                stack.callback(self._pool.shutdown, cancel_futures=True)
+                stack.callback(self._end_processes)
+                self._start_processes()
+            self._cleanup = stack.pop_all()
         return self
 
     def __exit__(
@@ -127,19 +131,31 @@ class LocalWorkers:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        is_own = os.getpid() == self._owner  # not in a process that a program has forked meanwhile
-        try:
-            if kind is None and is_own:
-                self._pool.shutdown()
-            self._alive.close()  # ends processes that still work
-            if is_own:
-                for process in self._processes:
-                    process.terminate()  # also while it starts
-                self._pool.shutdown(cancel_futures=True)
-        finally:
+        if os.getpid() != self._owner:  # in a process that a program has forked meanwhile
+            self._alive.close()
             self._watched.close()
-            if is_own:
-                shutil.rmtree(self._folder, ignore_errors=True)
+            return
+        with self._cleanup:
+            if kind is None:
+                self._pool.shutdown()
+
+    def _start_processes(self) -> None:
+        """Let all processes start, while this one reads the sample."""
+        self._starts = list[Future[int]]()
+        try:
+            with _interrupts_held():
+                for _ in range(self._count):
+                    self._starts.append(self._pool.submit(os.getpid))
+        except BrokenProcessPool as error:
+            raise self._run_error() from error
+
+    def _processes(self) -> list[BaseProcess]:
+        return [*(self._pool._processes or {}).values()]
+
+    def _end_processes(self) -> None:
+        self._alive.close()  # ends processes that work
+        for process in self._processes():
+            process.terminate()  # also while it starts
 
     def __call__(
         self, function: Callable[[Item], Result], items: Sequence[Item]
@@ -171,34 +187,35 @@ class LocalWorkers:
                 found = futures.popleft().result()
                 answer = pickle.loads(_taken(found) if isinstance(found, str) else found)
                 if answer.error is not None:
+                    answer.error.add_note(f"In a worker process:\n{answer.trace}")
                     raise answer.error
                 result: Result = answer.result
                 yield result
         except BrokenProcessPool as error:
-            if self._could_not_start():
-                raise RunError(
-                    "no worker process could start; a script that starts some must be a file, and "
-                    'guard its main code with `if __name__ == "__main__":`.'
-                ) from error
-            raise RunError(
-                f"a worker process ended unexpectedly, most likely for lack of memory; run the "
-                f"same command again, {self._remedy}."
-            ) from error
+            raise self._run_error() from error
         finally:
             for future in futures:
                 future.cancel()
 
-    def _could_not_start(self) -> bool:
-        """Return whether no process did any work, and one ended by an error, not by a signal."""
-        for process in self._processes:
+    def _run_error(self) -> RunError:
+        """Return why the pool broke: by an error in starting processes, or by a signal."""
+        for process in self._processes():
             process.join(WAKE_SECONDS)
-        is_failed = all(start.done() and start.exception() for start in self._starts)
-        return is_failed and any(process.exitcode == 1 for process in self._processes)
+        never_worked = all(start.done() and start.exception() for start in self._starts)
+        if never_worked and any(process.exitcode == 1 for process in self._processes()):
+            return RunError(
+                "no worker process could start; a script that starts some must be a file, and "
+                'guard its main code with `if __name__ == "__main__":`.'
+            )
+        return RunError(
+            f"a worker process ended unexpectedly, most likely for lack of memory; run the "
+            f"same command again, {self._remedy}."
+        )
 
 
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Start processes that Ctrl-C does not reach; this one gets it at the end of the context.
+    """Start processes that Ctrl-C does not reach, until :func:`_begin` ignores it.
 
     The pool must have been made before: Python ends the hold when it starts a process of its own.
     """
@@ -231,6 +248,7 @@ class _Answer(NamedTuple):
 
     result: Any = None
     error: Exception | None = None
+    trace: str = ""
 
 
 def _call(work: bytes, folder: str) -> bytes | str:
@@ -249,13 +267,13 @@ def _call(work: bytes, folder: str) -> bytes | str:
 
 def _pickled_error(error: Exception) -> bytes:
     """Pickle an error and its traceback; one that cannot be pickled becomes a RunError."""
-    error.add_note(f"In a worker process:\n{traceback.format_exc()}")
+    trace = traceback.format_exc()
     try:
-        content = pickle.dumps(_Answer(error=error))
+        content = pickle.dumps(_Answer(error=error, trace=trace))
         pickle.loads(content)
     except Exception:
-        kind = type(error).__name__
-        content = pickle.dumps(_Answer(error=RunError(f"a worker process failed: {kind}: {error}")))
+        text = f"a worker process failed: {type(error).__name__}: {error}"
+        content = pickle.dumps(_Answer(error=RunError(text), trace=trace))
     return content
 
 

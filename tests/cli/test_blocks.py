@@ -112,15 +112,22 @@ def test_images_leave_less_memory_for_one_piece(
         memory="2GB",
         workers=1,
         scheduler=None,
-        time_budget=None,
         device="auto",
     )
     for preset in ("standard", "matched"):
         assert block_memory(options, cvtgs.SimplifyConfig(preset=preset)) is None
-    options.time_budget = 60.0  # may choose a preset with images
-    assert block_memory(options, cvtgs.SimplifyConfig()) is None
-    less = 2_000_000_000 - IMAGE_BYTES
-    assert rooms == [2_000_000_000, less, less]
+    assert rooms == [2_000_000_000, 2_000_000_000 - IMAGE_BYTES]
+
+
+def test_a_time_budget_chooses_no_preset_whose_images_do_not_fit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cvtgs.save(random_scene(300), tmp_path / "in.ply")
+    words = ["simplify", str(tmp_path / "in.ply"), str(tmp_path / "out.ply"), "--rho", "0.1"]
+    words += ["--time-budget", "1h", "--shipped-rates", "--memory", "600MB"]
+    assert main(words) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Preset standard, the best that fits into 3600 s and, without images, into 600MB" in text
 
 
 def test_images_leave_less_memory_for_a_stream_in_one_piece(
@@ -136,3 +143,5 @@ def test_images_leave_less_memory_for_a_stream_in_one_piece(
     words += ["--preset", "matched", "--memory", "2GB", "--rho", "0.1"]
     assert main(words) == 1
     assert "streams in blocks need a preset without images" in capsys.readouterr().err
+    assert main([*words, "--memory", "600MB"]) == 1
+    assert "at least 800,000,000 with images of the scene" in capsys.readouterr().err

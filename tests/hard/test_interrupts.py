@@ -198,3 +198,19 @@ def test_the_handler_of_a_program_around_python_stays(monkeypatch):
             assert signal.signal(signal.SIGHUP, signal.SIG_DFL) == signal.SIG_DFL
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_a_second_signal_does_not_interrupt_what_the_first_one_ends(monkeypatch, capsys):
+    ended = []
+
+    def run(options):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            signal.raise_signal(signal.SIGTERM)  # here, calls wait for their threads
+            ended.append(True)
+
+    monkeypatch.setattr("cvtgs.cli.files.show_info", run)
+    assert (main(["info", "a.ply"]), ended) == (130, [True])
+    monkeypatch.setattr("cvtgs.cli.main.PATIENCE", 0.0)
+    assert (main(["info", "a.ply"]), ended) == (143, [True])

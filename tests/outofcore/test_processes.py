@@ -21,11 +21,11 @@ import pytest
 import cvtgs
 from cvtgs.cli.main import main
 from cvtgs.devices import core_count
-from cvtgs.errors import InvalidArgumentError, InvalidSceneError, OutputError, RunError
+from cvtgs.errors import InputError, InvalidArgumentError, InvalidSceneError, OutputError, RunError
 from cvtgs.outofcore import LocalWorkers, simplify_file
 from cvtgs.outofcore.memory import ROOMY_BYTES, worker_count
 from cvtgs.processes import MOST_SENT, _call
-from process_cases import die, fail, numbered, refuse, wait
+from process_cases import die, fail, miss, numbered, refuse, wait
 
 pytestmark = pytest.mark.slow  # every process loads torch
 
@@ -86,12 +86,15 @@ def test_errors_of_workers_reach_the_caller(workers):
     assert [number for number, _, _ in workers(numbered, [7])] == [7]
 
 
-def test_errors_of_workers_say_where_they_were_raised(workers):
-    with pytest.raises(InvalidSceneError) as caught:
-        list(workers(refuse, range(3)))
+@pytest.mark.parametrize(
+    ("function", "kind"), [(refuse, InvalidSceneError), (miss, InputError), (fail, RunError)]
+)
+def test_errors_of_workers_say_where_they_were_raised(workers, function, kind):
+    with pytest.raises(kind) as caught:
+        list(workers(function, range(3)))
     (note,) = caught.value.__notes__
     assert note.startswith("In a worker process:\nTraceback")
-    assert "in refuse" in note
+    assert f"in {function.__name__}" in note
 
 
 def test_large_results_come_through_files_that_are_removed(workers, tmp_path, monkeypatch):
@@ -130,40 +133,69 @@ def test_a_worker_that_dies_is_an_error():
 @on_posix
 def test_a_worker_killed_while_it_starts_is_not_a_missing_guard():
     with LocalWorkers(2) as found:
-        found._processes[0].kill()
+        found._processes()[0].kill()
         with pytest.raises(RunError, match="most likely for lack of memory"):
             list(found(numbered, range(2)))
 
 
 STARTING = """
+import signal
+import sys
 import time
 import torch  # every worker does the same, before it can ignore Ctrl-C itself
 from cvtgs.outofcore import LocalWorkers
 if __name__ == "__main__":
-    try:
-        with LocalWorkers(2):
-            print("started", flush=True)
-            time.sleep(60)
-    except KeyboardInterrupt:
-        print("ended")
+    with LocalWorkers(2) as workers:
+        print(*(process.pid for process in workers._processes()), flush=True)
+        for kind in sys.stdin:
+            if kind == "work\\n":
+                print(list(workers(abs, [-1])), flush=True)
+            else:
+                workers._pool.submit(time.sleep, 60)
+                signal.setitimer(signal.ITIMER_REAL, 0.2)  # while the end waits for the call
+                signal.signal(signal.SIGALRM, signal.default_int_handler)
+                break
 """
 
 
-@on_posix
-def test_an_interrupt_does_not_reach_starting_workers(tmp_path):
+@pytest.fixture
+def starting(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(STARTING, encoding="utf-8")
-    running = subprocess.Popen(
-        [sys.executable, script],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    assert running.stdout.readline() == "started\n"
-    time.sleep(0.3)
-    os.killpg(running.pid, signal.SIGINT)  # as a terminal does
-    assert running.communicate(timeout=60) == ("ended\n", "")
+    (tmp_path / "temporary").mkdir()
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    environment = os.environ | {"TMPDIR": str(tmp_path / "temporary")}
+    with subprocess.Popen([sys.executable, script], **pipes, text=True, env=environment) as running:
+        yield running
+        running.kill()
+
+
+@on_posix
+def test_an_interrupt_does_not_reach_starting_workers(starting):
+    for pid in starting.stdout.readline().split():
+        os.kill(int(pid), signal.SIGINT)  # as a terminal does, to all of them
+    assert starting.communicate("work\n", timeout=60) == ("[1]\n", "")
+
+
+@on_posix
+def test_an_interrupt_at_the_end_ends_the_workers_too(starting):
+    starting.stdout.readline()
+    _, errors = starting.communicate("leave\n", timeout=60)
+    assert errors.splitlines()[-1] == "KeyboardInterrupt"
+
+
+@on_posix
+def test_workers_of_a_killed_process_remove_its_temporary_folder(starting, tmp_path):
+    starting.stdout.readline()
+    starting.stdin.write("work\n")
+    starting.stdin.flush()
+    starting.stdout.readline()
+    assert len(list((tmp_path / "temporary").iterdir())) == 1
+    starting.kill()
+    end = time.monotonic() + 60
+    while list((tmp_path / "temporary").iterdir()):
+        assert time.monotonic() < end
+        time.sleep(0.05)
 
 
 @on_posix

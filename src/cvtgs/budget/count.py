@@ -299,6 +299,7 @@ def choose_preset(
     count: int | None = None,
     settings: Mapping[str, str] | None = None,
     model: CostModel | None = None,
+    with_images: bool = True,
 ) -> Choice:
     """Choose the best preset whose simplification fits a time.
 
@@ -314,6 +315,7 @@ def choose_preset(
             ``{"visibility.views": "0"}``.
         model: The cost of presets; None for :func:`cvtgs.budget.cost_model`, which measures it once
             on this machine.
+        with_images: Whether presets that render images may be chosen, which need 400 MB more.
 
     Returns:
         The preset, and its predicted seconds.
@@ -344,9 +346,11 @@ def choose_preset(
     if model is not None and not model.rates:
         raise InvalidArgumentError(f"model must be a CostModel with rates, found {shown(model)}.")
     known = cost_model() if model is None else model
+    configs = {name: SimplifyConfig.compose(preset=name, settings=settings) for name in CANDIDATES}
     costs = {
-        name: known.seconds(work, SimplifyConfig.compose(preset=name, settings=settings))
-        for name in CANDIDATES
+        name: known.seconds(work, config)
+        for name, config in configs.items()
+        if with_images or not config.uses_images
     }
     fitting = [name for name, cost in costs.items() if MARGIN * cost <= seconds]
     if not fitting:

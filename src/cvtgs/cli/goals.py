@@ -85,8 +85,10 @@ def choose_preset(
     scene: "GaussianScene",
     settings: Mapping[str, str],
     listener: "ProgressListener",
+    *,
+    with_images: bool = True,
 ) -> ChosenPreset:
-    """Choose the best preset that fits into the remaining time budget."""
+    """Choose the best preset that fits into the remaining time budget, and into memory."""
     from cvtgs.budget.calibrate import is_calibrated
 
     budget, spent = options.time_budget, time.perf_counter() - options.begun
@@ -111,13 +113,16 @@ def choose_preset(
         settings = {**settings, "merge.network": "false"}
     work = cvtgs.budget.Work.of(scene, target)
     try:
-        choice = cvtgs.budget.choose_preset(work, budget - spent, settings=settings, model=model)
+        choice = cvtgs.budget.choose_preset(
+            work, budget - spent, settings=settings, model=model, with_images=with_images
+        )
     except GoalError as error:
         raise GoalError(
             f"{error} Starting and reading took {spent:.1f} of {budget:g} s."
         ) from error
+    room = "" if with_images else f" and, without images, into {options.memory}"
     reason = (
-        f"Preset {choice.preset}, the best that fits into {budget:g} s: expected to take "
+        f"Preset {choice.preset}, the best that fits into {budget:g} s{room}: expected to take "
         f"{choice.seconds:.1f} s after {spent:.1f} s of starting and reading."
     )
     advice = "--recalibrate measures this machine again"

@@ -202,7 +202,7 @@ def run_jobs(
         except CvtgsError as error:
             failures += 1
             failed(job, error)
-            name = "" if str(source) in str(error) else f"{source}: "
+            name = "" if str(error).startswith(str(source)) else f"{source}: "
             say(printable_name(f"cvtgs: error: {place}{name}{error}"), file=sys.stderr)
         if outcome is None:
             gc.collect()  # the error and its frames refer to each other, and hold the scene
@@ -314,17 +314,18 @@ def _in_folder(folder: str) -> list[str]:
 
     if not os.path.isdir(folder) or _is_scene(folder):  # noqa: PTH112 (any path)
         return [folder]
-    if os.path.isfile(f"{folder}/tileset.json"):  # noqa: PTH113 (any path)
-        raise InputError(
-            f"{folder}: must be a scene or a folder of scenes, found 3D Tiles (tileset.json), "
-            "whose files are parts of a scene; cvtgs only writes them."
-        )
     found = sorted(glob.glob(f"{glob.escape(folder)}/*"))  # noqa: PTH207 (as text)
     scenes = [
         path
         for path in found
         if path.lower().endswith(READABLE_SUFFIXES) or (os.path.isdir(path) and _is_scene(path))  # noqa: PTH112 (any path)
     ]
+    is_tiled = os.path.isfile(f"{folder}/tileset.json")  # noqa: PTH113 (any path)
+    if is_tiled and all(path.lower().endswith(".glb") for path in scenes):
+        raise InputError(
+            f"{folder}: must be a scene or a folder of scenes, found 3D Tiles (tileset.json), "
+            "whose files are parts of a scene; cvtgs only writes them."
+        )
     return scenes or [folder]
 
 

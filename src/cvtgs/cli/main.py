@@ -4,10 +4,12 @@ import argparse
 import errno
 import gc
 import io
+import math
 import os
 import signal
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
@@ -33,6 +35,8 @@ from cvtgs.text import printable_name
 
 WRITE_SEVERAL = ("levels", "render", "compare", "tradeoff", "demo", "train")
 """Commands that write several files to one folder, which only one run at a time may do."""
+
+PATIENCE = 2.0  # seconds in which a second signal is ignored
 
 INTERRUPTED, PIPE_CLOSED = 130, 141  # exit status: 128 and the number of the signal
 BLOCKS_ADVICE = "process a binary .ply in blocks with --memory AMOUNT, for example 2GB"
@@ -180,16 +184,27 @@ def _fill_closed_streams() -> None:
 
 
 class _Stop:
-    """A handler of signals that raises KeyboardInterrupt and records the exit status."""
+    """A handler of signals that raises KeyboardInterrupt and records the exit status.
+
+    Further signals soon after it are ignored: they would interrupt the wait for threads, and
+    Python would end while these compute.
+    """
 
     def __init__(self) -> None:
         self.code: int | None = None
         self.is_held = False
+        self._raised = -math.inf
 
     def __call__(self, signum: int, frame: FrameType | None) -> None:
+        if time.monotonic() - self._raised < PATIENCE:
+            return
         self.code = 128 + signum
         if not self.is_held:
-            raise KeyboardInterrupt
+            self._raise()
+
+    def _raise(self) -> None:
+        self._raised = time.monotonic()
+        raise KeyboardInterrupt
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -200,7 +215,7 @@ class _Stop:
         finally:
             self.is_held = False
         if self.code is not None:
-            raise KeyboardInterrupt
+            self._raise()
 
     def notice(self, event: "sys.UnraisableHookArgs") -> None:
         """Send the signal again if its exception was raised where Python ignores exceptions."""
@@ -209,6 +224,7 @@ class _Stop:
             return
         if event.exc_type is KeyboardInterrupt:
             number = self.code - 128
+            self._raised = -math.inf
             while True:
                 with suppress(KeyboardInterrupt):  # on a busy machine, it comes before the end
                     again = threading.Timer(0.01, signal.raise_signal, (number,))

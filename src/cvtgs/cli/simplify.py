@@ -254,7 +254,9 @@ def _simplify_in_memory(
         config = with_limited_bands(config, options.sh_degree)
     cameras, chosen = read_cameras(options), None
     if options.time_budget is not None:
-        chosen = choose_preset(options, scene, settings, listener)
+        rendering = cvtgs.SimplifyConfig(preset="matched")
+        fits = options.memory is None or not _needs_blocks(options, memory_of(options), rendering)
+        chosen = choose_preset(options, scene, settings, listener, with_images=fits)
         config = cvtgs.SimplifyConfig.compose(preset=chosen.name, settings=settings)
         notes.append(chosen.reason)
     if cameras is None and config.uses_images:
@@ -339,7 +341,7 @@ def _needs_blocks(options: argparse.Namespace, memory: int, config: "SimplifyCon
     from cvtgs.grouping import finer_count
     from cvtgs.outofcore.memory import IMAGE_BYTES, block_count
 
-    if config.uses_images or options.time_budget is not None:  # it may choose a preset with images
+    if config.uses_images:
         memory -= IMAGE_BYTES
     rows = _rows_of(options.input)
     if rows is None:

@@ -139,7 +139,7 @@ def stream_blocks(
     from cvtgs.grouping import finer_count
     from cvtgs.io.axes import SCENE_AXES
     from cvtgs.io.ply import open_rows
-    from cvtgs.outofcore.memory import IMAGE_BYTES, block_count
+    from cvtgs.outofcore.memory import IMAGE_BYTES, block_count, check_memory
     from cvtgs.outofcore.run import check_config
     from cvtgs.streams import stream_file
     from cvtgs.streams.plan import CHUNK_GAUSSIANS
@@ -151,6 +151,7 @@ def stream_blocks(
             targets = {cvtgs.target_count(rows.count, rho) for rho in rhos}
             finest = max(targets - {rows.count}, default=rows.count)  # a whole level merges nothing
             merging = finer_count(finest, rows.count, config.allocation)
+            check_memory(memory if asked else None, with_images=config.uses_images)
             room = memory - IMAGE_BYTES if config.uses_images else memory
             # Levels one after the other need a little more memory than the finest alone.
             if block_count(rows, room, merging=merging + merging // 4) == 1:

@@ -1,6 +1,7 @@
 """Start and stop a viser server, to which only its own page may connect."""
 
 import io
+import os
 import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 __all__ = ["check_viewer", "start_server", "stop_server"]
 
 _STARTING = Lock()  # held while the server of websockets is replaced
+
+_MOST_PORTS, _LAST_PORT = 1000, 65535  # number of ports to try, as viser does
 
 _OWN_NAMES = {"localhost", "127.0.0.1", "::1"}
 
@@ -43,7 +46,7 @@ def start_server(host: str, port: int) -> "viser.ViserServer":
     check_viewer()
     import viser  # noqa: PLC0415 (optional)
 
-    address = _address_of(host)  # viser would wait for ever if it cannot listen
+    address, port = _open_address(host, port)  # viser would wait for ever if it cannot listen
     with redirect_stdout(io.StringIO()):  # viser prints even if verbose is False
         if not ip_address(address.partition("%")[0]).is_loopback:
             return viser.ViserServer(host=host, port=port, label="cvtgs", verbose=False)
@@ -57,8 +60,8 @@ def stop_server(server: "viser.ViserServer") -> None:
         server.stop()
 
 
-def _address_of(host: str) -> str:
-    """Return the address of a host; raise unless this machine can listen on it."""
+def _open_address(host: str, port: int) -> tuple[str, int]:
+    """Return the address of a host, and the first free port; raise if there is none."""
     try:
         family, kind, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind) as probe:
@@ -68,7 +71,21 @@ def _address_of(host: str) -> str:
             f"host must be an address or a name of this machine, found {host!r}: "
             f"{reason_of(error)}."
         ) from error
-    return str(address[0])
+    last = min(port + _MOST_PORTS, _LAST_PORT)
+    for number in range(port, last + 1):
+        with socket.socket(family, kind) as probe:
+            if os.name == "posix":  # ports of connections that have just ended are free
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((address[0], number, *address[2:]))
+            except PermissionError as error:
+                raise InvalidArgumentError(
+                    f"port must be one that this user may open, found {port}: {reason_of(error)}."
+                ) from error
+            except OSError:
+                continue
+            return str(address[0]), number
+    raise InvalidArgumentError(f"a port from {port} to {last} must be free, found none.")
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from cvtgs.math.frames import robust_frame
 from cvtgs.math.parameters import build_covariances, normalize_quats
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
-from cvtgs.text import counted, printable, printable_name, shortened
+from cvtgs.text import counted, printable, printable_name, shortened, shown
 from cvtgs.validity import valid_part
 from cvtgs.viewer.connection import start_server, stop_server
 from cvtgs.viewer.scenes import FULL, SIMPLIFIED, SceneViewer, camera_of
@@ -132,9 +132,9 @@ class SceneNode:
 def record_page(server: "viser.ViserServer", nodes: Sequence[SceneNode]) -> str:
     """Record the scenes one after the other, and return the page."""
     recorder = server.get_scene_serializer()
-    for shown in nodes:
+    for one in nodes:
         for node in nodes:
-            node.show(node is shown)
+            node.show(node is one)
         recorder.insert_sleep(_FLIP_SECONDS)
     names = shortened(", ".join(node.name for node in nodes), 120)
     title = f"<title>Scenes in 3D: {escape(names)}</title>"
@@ -278,6 +278,7 @@ class ViewerServer:
         try:
             self._work_until_closed()
         finally:
+            self._first.set()
             self._ended.set()
 
     def _work_until_closed(self) -> None:
@@ -291,7 +292,7 @@ class ViewerServer:
                 self._first.set()
                 if is_first and not (self._wanted.is_set() or self._closed):
                     # The next run reports errors.
-                    with suppress(CvtgsError), memory_errors("this", _ADVICE):
+                    with suppress(Exception):
                         self._viewer.warm_up(self._preset.value)
 
     def _move(self) -> None:
@@ -343,7 +344,10 @@ class ViewerServer:
     def _save(self) -> str:
         """Save the shown scene; with ``host``, others than the user of this machine may do so."""
         name = self._path.value.strip()
-        is_below = Path(name).resolve().is_relative_to(Path.cwd().resolve())  # links followed
+        try:
+            is_below = Path(name).resolve().is_relative_to(Path.cwd().resolve())  # links followed
+        except (OSError, RuntimeError, ValueError) as error:  # no folder, a loop, a null byte
+            raise OutputError(f"{shown(name)}: must be a path to write to: {error}.") from error
         if name and not (is_within(name) and is_below):
             raise OutputError(
                 f"{name}: a scene is saved in the folder where the program was started, or below."
@@ -362,8 +366,9 @@ class ViewerServer:
             self._notes.content = f"**{plain(str(error))}**"
             return error
         except Exception as error:  # such as for a value that only another program would send
-            traceback.print_exc()
             self._notes.content = f"**unexpected error ({type(error).__name__}): see the terminal**"
+            with suppress(OSError, ValueError):  # nothing reads the terminal
+                traceback.print_exc()
             return error
         return None
 
