@@ -279,8 +279,9 @@ def _pickled_error(error: Exception) -> bytes:
 
 def _taken(path: str) -> bytes:
     """Read and remove a temporary file."""
-    content = Path(path).read_bytes()
-    Path(path).unlink()
+    with _temporary_errors():
+        content = Path(path).read_bytes()
+        Path(path).unlink()
     return content
 
 

@@ -54,9 +54,9 @@ class Limits:
             steps = checked_whole(steps, "the number of refinement steps")
         self._start = time.perf_counter()
         self._last = self._start
-        self.seconds: float | None = (
-            None if seconds is None else float(seconds)
-        )  # also one of numpy
+        self.seconds: float | None = None
+        if seconds is not None:
+            self.seconds = float(seconds)  # also one of numpy
         self._steps = steps
         self._slowest = {"step": 0.0, "check": 0.0}
         self.steps: int = 0
