@@ -77,7 +77,10 @@ def test_the_transparent_value_of_a_grey_image_shows_the_background(tmp_path, dt
     white = int(np.iinfo(dtype).max)
     values = np.zeros((8, 8), dtype=dtype)
     values[:, 4:] = white
-    Image.fromarray(values).save(tmp_path / "a.png", transparency=white)
+    try:
+        Image.fromarray(values).save(tmp_path / "a.png", transparency=white)
+    except OSError:
+        pytest.skip("this Pillow writes no transparent value of 16 bits")
     found = read_image(tmp_path / "a.png", (8, 8), (0.0, 1.0, 0.5))
     assert found[:, :4].max() == 0.0
     assert found[0, 7].tolist() == [0.0, 1.0, 0.5]
