@@ -50,6 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         warnings.simplefilter("always", UserWarning)
+        warnings.simplefilter("ignore", FutureWarning)  # of libraries, to their callers
         # Of a damaged checkpoint, before it is refused.
         warnings.filterwarnings("ignore", "TypedStorage is deprecated", module="torch")
         try:
