@@ -135,9 +135,8 @@ class LocalWorkers:
             self._alive.close()
             self._watched.close()
             return
-        with self._cleanup:
-            if kind is None:
-                self._pool.shutdown()
+        # Results are taken by now, and Ctrl-C in a wait for the pool would leave its processes.
+        self._cleanup.close()
 
     def _start_processes(self) -> None:
         """Let all processes start, while this one reads the sample."""

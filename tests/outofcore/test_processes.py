@@ -139,7 +139,6 @@ def test_a_worker_killed_while_it_starts_is_not_a_missing_guard():
 
 
 STARTING = """
-import signal
 import sys
 import time
 import torch  # every worker does the same, before it can ignore Ctrl-C itself
@@ -151,9 +150,7 @@ if __name__ == "__main__":
             if kind == "work\\n":
                 print(list(workers(abs, [-1])), flush=True)
             else:
-                workers._pool.submit(time.sleep, 60)
-                signal.setitimer(signal.ITIMER_REAL, 0.2)  # while the end waits for the call
-                signal.signal(signal.SIGALRM, signal.default_int_handler)
+                workers._pool.submit(time.sleep, 600)
                 break
 """
 
@@ -178,10 +175,11 @@ def test_an_interrupt_does_not_reach_starting_workers(starting):
 
 
 @on_posix
-def test_an_interrupt_at_the_end_ends_the_workers_too(starting):
+def test_the_end_does_not_wait_for_calls_whose_results_nothing_takes(starting):
+    """Ctrl-C in such a wait would leave the processes: before 3.13, Python takes it for over."""
     starting.stdout.readline()
-    _, errors = starting.communicate("leave\n", timeout=60)
-    assert errors.splitlines()[-1] == "KeyboardInterrupt"
+    assert starting.communicate("leave\n", timeout=60) == ("", "")
+    assert starting.returncode == 0
 
 
 @on_posix

@@ -242,8 +242,9 @@ def test_the_checkpoint_of_another_training_is_refused(scenes, cache, tmp_path):
     path = tmp_path / "net.safetensors"
     run(config_of(scenes, keep="last"), path, cache)
     for changes in ({"seed": 5}, {"steps": STEPS - 2}):
-        run(config_of(scenes, keep="last", **changes), tmp_path / "other.safetensors", cache)
-        path.write_bytes((tmp_path / "other.safetensors").read_bytes())
+        other = tmp_path / f"{next(iter(changes))}.safetensors"
+        run(config_of(scenes, keep="last", **changes), other, cache)
+        path.write_bytes(other.read_bytes())
         with pytest.raises(CheckpointError, match="the network is of another training run than"):
             run(config_of(scenes, keep="last"), path, cache, resume=True)
 
