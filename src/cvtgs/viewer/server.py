@@ -181,7 +181,8 @@ class ViewerServer:
     Raises:
         MissingDependencyError: viser is not installed.
         ConfigError: The preset does not exist.
-        InvalidArgumentError: The ratio is out of range, or the host is not this machine.
+        InvalidArgumentError: The ratio is out of range, the host is not this machine, or no port
+            is free or may be opened.
     """
 
     def __init__(
