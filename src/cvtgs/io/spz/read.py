@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from collections.abc import Iterator
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
@@ -36,6 +37,7 @@ Blocks = dict[str, UInt8[np.ndarray, "b"]]
 
 _GZIP, _START = b"\x1f\x8b", MAGIC.to_bytes(4, "little")
 
+_GZIP_BITS = zlib.MAX_WBITS | 16  # zlib's code for gzip
 _MOST_BITS = 24
 
 _TABLE_START = slice(16, 20)
@@ -105,8 +107,12 @@ def decode_spz(
     content: bytes, path: Path | str, *, axes: str | None, trust_sizes: bool
 ) -> GaussianScene:
     """Decode the bytes of an ``.spz`` file as :func:`read_spz` does."""
-    read = _read_gzip if _is_gzip(content, path) else _read_version_4
-    header, blocks, stated = read(content, path, trust_sizes=trust_sizes)
+    header = peek_spz(content, path)
+    if not trust_sizes:
+        check_expansion(path, count=header.count, sh_degree=header.sh_degree, stored=len(content))
+    read = _read_version_4 if header.version == 4 else _read_gzip
+    blocks, extensions = read(content, header, path)
+    stated = _stated_axes(extensions, path)
     if header.sh_degree > 3:
         warn(
             f"{path}: left out the SH bands above degree 3 (the file has degree "
@@ -120,24 +126,18 @@ def decode_spz(
 
 def peek_spz(content: bytes, path: Path | str) -> SpzHeader:
     """Return the header of the bytes of an ``.spz`` file, without unpacking its Gaussians."""
-    if not _is_gzip(content, path):
+    if content.startswith(_START):
         return _header(content[: HEADER.size], path, versions=(4,))
-    stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
+    if not content.startswith(_GZIP):
+        raise FileFormatError(
+            f"{path}: an .spz file must start with the magic number of gzip or SPZ, "
+            f"found {content[:4]!r}."
+        )
     try:
-        start = stream.decompress(content, HEADER.size)
+        start = zlib.decompressobj(wbits=_GZIP_BITS).decompress(content, HEADER.size)
     except zlib.error as error:
         raise _damage(path, error) from error
     return _header(start, path, versions=(1, 2, 3))
-
-
-def _is_gzip(content: bytes, path: Path | str) -> bool:
-    """Return whether bytes are those of version 1 to 3, not 4; others are refused."""
-    if content.startswith((_GZIP, _START)):
-        return content.startswith(_GZIP)
-    raise FileFormatError(
-        f"{path}: an .spz file must start with the magic number of gzip or SPZ, "
-        f"found {content[:4]!r}."
-    )
 
 
 def _unpack(header: SpzHeader, blocks: Blocks) -> Arrays:
@@ -176,21 +176,14 @@ def _quats(stored: UInt8[np.ndarray, "n b"]) -> Float[np.ndarray, "n 4"]:
     return np.roll(restore_largest((words >> 30).astype(np.int64), others), 1, axis=1)
 
 
-def _read_gzip(
-    content: bytes, path: Path | str, *, trust_sizes: bool
-) -> tuple[SpzHeader, Blocks, str | None]:
-    """Return the header, the blocks, and the axes if an extension after the blocks states them."""
-    stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
+def _read_gzip(content: bytes, header: SpzHeader, path: Path | str) -> tuple[Blocks, bytes]:
+    """Return the blocks of version 1 to 3, and the extensions after them."""
+    stream, wanted = zlib.decompressobj(wbits=_GZIP_BITS), sum(header.sizes.values())
+    is_extended = bool(header.flags & EXTENSIONS_FLAG)
+    most = _MOST_EXTENSION_BYTES if is_extended else 1
     try:
-        header = _header(stream.decompress(content, HEADER.size), path, versions=(1, 2, 3))
-        wanted = sum(header.sizes.values())
-        if not trust_sizes:
-            check_expansion(
-                path, count=header.count, sh_degree=header.sh_degree, stored=len(content)
-            )
+        stream.decompress(content, HEADER.size)
         payload = stream.decompress(stream.unconsumed_tail, wanted)
-        is_extended = bool(header.flags & EXTENSIONS_FLAG)
-        most = _MOST_EXTENSION_BYTES if is_extended else 1
         surplus = stream.decompress(stream.unconsumed_tail, most)
     except zlib.error as error:
         raise _damage(path, error) from error
@@ -199,7 +192,8 @@ def _read_gzip(
             f"{path}: must hold {wanted:,} bytes for the {header.count:,} Gaussians of SH degree "
             f"{header.sh_degree} that the header promises, found {len(payload):,}."
         )
-    if is_extended and (stream.unconsumed_tail or _end_of_records(surplus) != len(surplus)):
+    is_whole = sum(8 + size for _, size, _ in _records(surplus)) == len(surplus)
+    if is_extended and (stream.unconsumed_tail or not is_whole):
         raise FileFormatError(  # a draft had them before the Gaussians, which are then others
             f"{path}: the extensions after the Gaussians must be whole records of at most "
             f"{_MOST_EXTENSION_BYTES:,} bytes together, found others; write it as version 4."
@@ -214,15 +208,11 @@ def _read_gzip(
         raise FileFormatError(f"{path}: must be intact gzip data, found it cut short.")
     ends = np.cumsum(list(header.sizes.values()), dtype=np.int64)[:-1]
     blocks = np.split(np.frombuffer(payload, np.uint8), ends)
-    extensions = surplus if is_extended else b""
-    return header, dict(zip(header.sizes, blocks, strict=True)), _stated_axes(extensions, path)
+    return dict(zip(header.sizes, blocks, strict=True)), surplus if is_extended else b""
 
 
-def _read_version_4(
-    content: bytes, path: Path | str, *, trust_sizes: bool
-) -> tuple[SpzHeader, Blocks, str | None]:
-    """Return the header, the blocks, and the axes if the file states them."""
-    header = _header(content[: HEADER.size], path, versions=(4,))
+def _read_version_4(content: bytes, header: SpzHeader, path: Path | str) -> tuple[Blocks, bytes]:
+    """Return the blocks, and the extensions before them."""
     sizes = {name: size for name, size in header.sizes.items() if size}
     start = int.from_bytes(content[_TABLE_START], "little")
     table = content[start : start + TABLE_ENTRY.size * len(sizes)]
@@ -232,8 +222,6 @@ def _read_version_4(
             f"{path}: must hold {len(sizes)} blocks, found a table of {header.streams} at byte "
             f"{start:,} of {len(content):,}."
         )
-    if not trust_sizes:
-        check_expansion(path, count=header.count, sh_degree=header.sh_degree, stored=len(content))
     blocks = {"sh": np.empty(0, np.uint8)}
     at = start + TABLE_ENTRY.size * len(sizes)
     for (name, size), (packed, unpacked) in zip(
@@ -246,36 +234,34 @@ def _read_version_4(
             )
         blocks[name] = _unzstd(content[at : at + packed], size, f"{path}: block {name!r}")
         at += packed
-    extensions = content[FOURTH_HEADER_BYTES:start] if header.flags & EXTENSIONS_FLAG else b""
-    return header, blocks, _stated_axes(extensions, path)
+    return blocks, content[FOURTH_HEADER_BYTES:start] if header.flags & EXTENSIONS_FLAG else b""
 
 
 def _damage(path: Path | str, error: zlib.error) -> FileFormatError:
     return FileFormatError(f"{path}: must be intact gzip data, found damage: {error}.")
 
 
-def _end_of_records(extensions: bytes) -> int:
-    """Return the byte after the last record of extensions; more than there are if it is cut."""
+def _records(extensions: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Yield the type, the stated size and the content of each record; the last may be cut."""
     at = 0
     while at + 8 <= len(extensions):
-        at += 8 + int.from_bytes(extensions[at + 4 : at + 8], "little")
-    return at
+        kind, size = struct.unpack_from("<II", extensions, at)
+        yield kind, size, extensions[at + 8 : at + 8 + size]
+        at += 8 + size
 
 
 def _stated_axes(extensions: bytes, path: Path | str) -> str | None:
-    """Return the axes that extensions state; these are records of type, size and content."""
-    axes, at = None, 0
-    while at + 8 <= len(extensions):
-        kind, size = struct.unpack_from("<II", extensions, at)
+    """Return the axes that extensions state."""
+    axes = None
+    for kind, size, content in _records(extensions):
         if kind == AXES_EXTENSION:
-            number = int.from_bytes(extensions[at + 8 : at + 12], "little")
-            if size != 4 or len(extensions) < at + 12 or number > len(AXES):
+            number = int.from_bytes(content[:4], "little")
+            if size != 4 or len(content) < 4 or number > len(AXES):
                 raise FileFormatError(
                     f"{path}: the extension for the axes must hold a 4-byte number from 0 to "
                     f"{len(AXES)}, found {number} in {size:,} bytes."
                 )
             axes = AXES[number - 1] if number else "rub"  # as Niantic's library takes it
-        at += 8 + size
     return axes
 
 
