@@ -15,8 +15,8 @@ from cvtgs.io.axes import AXES, SCENE_AXES, change_axes
 from cvtgs.io.files import check_expansion, open_input
 from cvtgs.scene import GaussianScene
 
-MAGIC = 0x5053474E
-HEADER = struct.Struct("<IIIBBBB")
+MAGIC = b"NGSP"
+HEADER = struct.Struct("<4sIIBBBB")
 ANTIALIASED_FLAG = 1
 EXTENSIONS_FLAG = 2
 AXES_EXTENSION = 0xADBE0003  # the type of Adobe's extension for the axes, which it numbers from 1
@@ -35,12 +35,10 @@ STORED_REST_COUNTS = (0, 3, 8, 15, 24)
 Blocks = dict[str, UInt8[np.ndarray, "b"]]
 """Bytes by name: means, opacities, colors, log_scales, quats, sh."""
 
-_GZIP, _START = b"\x1f\x8b", MAGIC.to_bytes(4, "little")
+_GZIP = b"\x1f\x8b"
 
 _GZIP_BITS = zlib.MAX_WBITS | 16  # zlib's code for gzip
 _MOST_BITS = 24
-
-_TABLE_START = slice(16, 20)
 
 _MOST_EXTENSION_BYTES = 1 << 20  # of versions 1 to 3; real ones have a few dozen bytes
 
@@ -126,7 +124,7 @@ def decode_spz(
 
 def peek_spz(content: bytes, path: Path | str) -> SpzHeader:
     """Return the header of the bytes of an ``.spz`` file, without unpacking its Gaussians."""
-    if content.startswith(_START):
+    if content.startswith(MAGIC):
         return _header(content[: HEADER.size], path, versions=(4,))
     if not content.startswith(_GZIP):
         raise FileFormatError(
@@ -214,7 +212,7 @@ def _read_gzip(content: bytes, header: SpzHeader, path: Path | str) -> tuple[Blo
 def _read_version_4(content: bytes, header: SpzHeader, path: Path | str) -> tuple[Blocks, bytes]:
     """Return the blocks, and the extensions before them."""
     sizes = {name: size for name, size in header.sizes.items() if size}
-    start = int.from_bytes(content[_TABLE_START], "little")
+    start = int.from_bytes(content[16:20], "little")  # of the table
     table = content[start : start + TABLE_ENTRY.size * len(sizes)]
     is_whole = start >= FOURTH_HEADER_BYTES and len(table) == TABLE_ENTRY.size * len(sizes)
     if header.streams != len(sizes) or not is_whole:
@@ -266,10 +264,10 @@ def _stated_axes(extensions: bytes, path: Path | str) -> str | None:
 
 
 def _header(start: bytes, path: Path | str, *, versions: tuple[int, ...]) -> SpzHeader:
-    if len(start) < HEADER.size or not start.startswith(_START):
+    if len(start) < HEADER.size or not start.startswith(MAGIC):
         raise FileFormatError(
             f"{path}: an .spz file must start with a header of {HEADER.size} bytes that begin "
-            f"with {_START!r}, found {len(start)} that begin with {start[:4]!r}."
+            f"with {MAGIC!r}, found {len(start)} that begin with {start[:4]!r}."
         )
     _, *fields = HEADER.unpack(start)
     header = SpzHeader(*fields)
