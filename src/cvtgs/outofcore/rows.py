@@ -33,7 +33,7 @@ class BlockRows(NamedTuple):
 def record_type(job: Job, *, with_cell: bool = False) -> np.dtype[Any]:
     """Return the type of a row in the files of a job."""
     more = [(CELL, "<i4")] if with_cell else []
-    return np.dtype([*job.source.names, (AREA, "<f8"), (VISIBILITY, "<f4"), *more])
+    return np.dtype([*job.source.dtype.descr, (AREA, "<f8"), (VISIBILITY, "<f4"), *more])
 
 
 def read_rows(job: Job, block: int, *, is_slim: bool = False) -> BlockRows:

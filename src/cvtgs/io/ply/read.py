@@ -296,17 +296,12 @@ class PlyRows:
 
     path: str
     count: int
-    names: tuple[tuple[str, str], ...]  # names and numpy types of the columns
+    dtype: np.dtype[Any]  # of a row
     layout: Layout  # names and PLY types of the columns, as a scene keeps them
     comments: tuple[str, ...]
     offset: int  # where the first row starts, in bytes
     sh_degree: int | None = None  # SH bands above it are left out of scenes; None keeps all
     axes: str = SCENE_AXES  # of the file
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """The type of a row."""
-        return np.dtype(list(self.names))
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Map a range of rows into memory; pages are read on use."""
@@ -373,7 +368,7 @@ def open_rows(
     return PlyRows(
         path=str(Path(name).absolute()),  # for workers in other folders
         count=vertex.count,
-        names=tuple((prop.name, "<" + SCALARS[prop.type].code) for prop in vertex.properties),
+        dtype=row_dtype(vertex.columns),
         layout=layout_of(vertex),
         comments=header.comments,
         offset=header.data_offset,

@@ -66,7 +66,7 @@ def join_plys(paths: Sequence[str | os.PathLike[str]], file: BinaryIO) -> None:
     parts = [open_rows(path) for path in paths]
     first, total = parts[0], sum(part.count for part in parts)
     for part in parts:
-        if part.names != first.names:
+        if part.dtype != first.dtype:
             raise FileFormatError(f"{part.path}: must have the same columns as {first.path}.")
     file.write(header_bytes(first.comments, [("vertex", total, first.layout)]))
     for part in parts:
