@@ -38,11 +38,11 @@ _ROW = np.dtype(
 _OTHERS = (b"ply\n", b"ply\r", b"<!do", b"<htm", b"<?xm")  # starts of PLY files and web pages
 _CHUNK_ROWS = 1 << 16
 
-HEADER_BYTES, SECTION_BYTES = 4096, 1024
+HEADER_BYTES = 4096
 
 _HEADER = struct.Struct("<BBxxIIIIHxx3fff")
 
-_SECTION = struct.Struct("<IIIIfHxxIIIIH")
+_SECTION = struct.Struct("<IIIIfHxxIIIIH982x")
 
 _NUMBERS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 """Types of positions, of scales and rotations, and of SH, by compression level."""
@@ -139,16 +139,12 @@ def read_ksplat(path: Path) -> GaussianScene:
                 f"{path}: must be a .ksplat of version 0.1 with compression 0, 1 or 2, found "
                 f"version {major}.{minor} and compression {level}."
             )
-        ends = HEADER_BYTES + most * SECTION_BYTES
-        if ends > size:
+        if HEADER_BYTES + most * _SECTION.size > size:
             raise FileFormatError(
                 f"{path}: must hold the headers of {most:,} sections, found {size:,} bytes."
             )
-        headers = file.read(most * SECTION_BYTES)
-        sections = [
-            _Section(*_SECTION.unpack_from(headers, number * SECTION_BYTES))
-            for number in range(most)
-        ]
+        headers = file.read(most * _SECTION.size)
+        sections = [_Section(*fields) for fields in _SECTION.iter_unpack(headers)]
         sh_range = (low or _SH_RANGE[0], high or _SH_RANGE[1])
         degree = max((one.sh_degree for one in sections if one.used), default=0)
         parts = []
