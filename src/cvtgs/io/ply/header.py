@@ -56,15 +56,9 @@ SCALARS: Mapping[str, ScalarType] = {
 """PLY number types by their canonical names."""
 
 TYPE_NAMES: Mapping[str, str] = {
-    **{name: name for name in SCALARS},
-    "int8": "char",
-    "uint8": "uchar",
-    "int16": "short",
-    "uint16": "ushort",
-    "int32": "int",
-    "uint32": "uint",
-    "float32": "float",
-    "float64": "double",
+    alias: name
+    for name, kind in SCALARS.items()
+    for alias in (name, np.dtype(kind.code).name)  # such as uchar and uint8
 }
 """Canonical names of PLY number types, by all their names."""
 
