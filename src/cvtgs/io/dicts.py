@@ -46,7 +46,6 @@ SMALL_SCALE = 0.5
 """Scales look activated if all are above 0 and their median is below this. As logarithms, they
 would be of Gaussians of nearly one size above one unit; standard deviations are often like that."""
 
-_NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN", "features_dc", "features_rest")
 _ALLOWED = re.compile(
     r"collections\.(OrderedDict|defaultdict)|torch\._utils\._rebuild_(tensor(_v2)?|parameter)|"
     r"torch\.(\w+Storage|Size|device|u?int\d+|b?float\d+(_\w+)?|bool|nn\.parameter\.Parameter)|"
@@ -308,7 +307,7 @@ def _scene_tensors(content: Any, path: Path) -> tuple[dict[str, Tensor], bool]:
     state = groups[group] if group else groups  # the dictionary of tensors may be all there is
     state = state if isinstance(state, Mapping) else {}
     for prefix in _PREFIXES:
-        tensors = {name: state[prefix + name] for name in _NAMES if prefix + name in state}
+        tensors = {name: state[prefix + name] for name in _TENSORS if prefix + name in state}
         if "means" in tensors:
             return tensors, "features_dc" in tensors
     found = ", ".join(shown(name) for name in islice(state, 5)) or "nothing of it"
