@@ -233,12 +233,11 @@ def _packed(
     scale, scale_range = _fractions(log_scales[order])
     color, color_range = _fractions(colors_of_sh0(arrays.sh0[order]))
     largest, others = drop_largest(arrays.quats[order])
-    none = np.zeros(len(order), np.uint32)
     words = [
-        _pack(place, _THREE_BITS, high=none),
-        _pack(others * HALF_RANGE + 0.5, _QUAT_BITS, high=largest.astype("u4")),
-        _pack(scale, _THREE_BITS, high=none),
-        _pack(color, _COLOR_BITS[:3], high=none) << np.uint32(8) | opacities,
+        _pack(place, _THREE_BITS),
+        largest.astype(np.uint32) << np.uint32(30) | _pack(others * HALF_RANGE + 0.5, _QUAT_BITS),
+        _pack(scale, _THREE_BITS),
+        _pack(color, _COLOR_BITS[:3]) << np.uint32(8) | opacities,
     ]
     return np.concatenate([place_range, scale_range, color_range], axis=1), np.stack(words, axis=1)
 
@@ -256,11 +255,9 @@ def _fractions(
     return fractions, 2 * np.concatenate([low, high], axis=1)
 
 
-def _pack(
-    fractions: Float[np.ndarray, "n k"], bits: tuple[int, ...], *, high: UInt32[np.ndarray, "n"]
-) -> UInt32[np.ndarray, "n"]:
-    """Pack fractions side by side into 32 bits."""
-    words = high
+def _pack(fractions: Float[np.ndarray, "n k"], bits: tuple[int, ...]) -> UInt32[np.ndarray, "n"]:
+    """Pack fractions side by side into the low bits of 32."""
+    words = np.zeros(len(fractions), np.uint32)
     for column, size in zip(fractions.T, bits, strict=True):
         most = (1 << size) - 1
         field = np.clip(np.floor(column * most + 0.5), 0, most).astype(np.uint32)
