@@ -107,9 +107,8 @@ def inria_views(entries: Sequence[Any], path: Path) -> list[View]:
 def transforms_views(content: Any, path: Path, split: Split | None) -> list[View]:
     """Read the frames of a ``transforms.json``."""
     document = validated(_Transforms, content, str(path))
-    shared = validated(_Intrinsics, content, str(path))
     views = [
-        _view(frame, shared, path=path, where=f"{path}: frame {row}")
+        _view(frame, document, path=path, where=f"{path}: frame {row}")
         for row, frame in enumerate(document.frames)
     ]
     if split is None:
@@ -148,7 +147,8 @@ def _view(content: Any, shared: _Intrinsics, *, path: Path, where: str) -> View:
 def _lens(frame: _Frame, shared: _Intrinsics, *, path: Path, where: str) -> Lens:
     """Build a lens; each number is from the frame, else the file, else from the image size."""
     levels = ((frame, where), (shared, str(path)))
-    frame = frame.model_copy(update={key: v for key, v in shared if getattr(frame, key) is None})
+    missing = [key for key in _Intrinsics.model_fields if getattr(frame, key) is None]
+    frame = frame.model_copy(update={key: getattr(shared, key) for key in missing})
     width, height = _size(frame, path=path, where=where)
     fx, fy = _focal(levels, "x", pixels=width), _focal(levels, "y", pixels=height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
