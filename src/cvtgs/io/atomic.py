@@ -313,18 +313,11 @@ def _claim(temporary: Path, target: Path) -> None:
             own = os.fstat(file.fileno())
         replace_file(temporary, target)
     except BaseException:
-        if own is not None and _is(target, own):
-            target.unlink()
+        with suppress(OSError):
+            found = target.stat()
+            if own is not None and os.path.samestat(found, own) and found.st_size == 0:
+                target.unlink()
         raise
-
-
-def _is(path: Path, empty: os.stat_result) -> bool:
-    """Return whether a path is still the empty file that we made."""
-    try:
-        found = path.stat()
-    except OSError:
-        return False
-    return os.path.samestat(found, empty) and found.st_size == 0
 
 
 def _concerns(error: OSError, target: Path) -> bool:
