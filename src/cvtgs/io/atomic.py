@@ -252,7 +252,6 @@ def _target(path: str | os.PathLike[str]) -> Path:
 
 
 def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
-    """Move the finished file to its name."""
     if overwrite:
         if target.exists() and not _WINDOWS:
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))

@@ -109,7 +109,6 @@ def _checked_image(name: str, camera: int, *, pose: Sequence[float], where: str)
 
 
 def _find_model(name: str, where: str) -> _Model:
-    """Return a camera model by its name."""
     if name not in _MODELS:
         raise FileFormatError(
             f"{where}: the camera model must be one of {', '.join(_MODELS)}, found "
@@ -179,7 +178,6 @@ class _Bytes:
 
 
 def _cameras_of_bin(path: Path) -> dict[int, Lens]:
-    """Read ``cameras.bin``."""
     lenses: dict[int, Lens] = {}
     with open_input(path) as file:
         data = _Bytes(file=file, path=path)

@@ -181,7 +181,6 @@ def to_dict(scene: GaussianScene) -> dict[str, Tensor]:
 
 
 def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
-    """Find the key of each scene tensor."""
     prefix = _prefix(mapping)
     keys: dict[str, str] = {}
     for key in mapping:

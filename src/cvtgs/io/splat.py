@@ -166,7 +166,6 @@ def read_ksplat(path: Path) -> GaussianScene:
 
 
 def _row_type(level: int, degree: int, path: Path) -> np.dtype[Any]:
-    """Return the layout of a Gaussian."""
     if degree >= len(_COMPONENTS):
         raise FileFormatError(
             f"{path}: a .ksplat must have an SH degree of at most {len(_COMPONENTS) - 1}, "

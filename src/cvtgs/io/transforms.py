@@ -197,7 +197,6 @@ def _size(frame: _Frame, *, path: Path, where: str) -> tuple[int, int]:
 
 
 def _png_size(path: Path) -> tuple[int, int]:
-    """Read the size of a PNG image from its first bytes."""
     with open_input(path) as file:
         start = file.read(_PNG_START.size)
     if len(start) == _PNG_START.size:

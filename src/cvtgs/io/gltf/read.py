@@ -155,7 +155,6 @@ def _splats(file: GltfFile, most: float) -> list[tuple[_Splats, Matrix]]:
 
 
 def _splats_of(file: GltfFile, index: int, primitives: list[Any]) -> Iterator[_Splats]:
-    """Yield the primitives of a mesh that are splats."""
     for number, value in enumerate(primitives):
         where = f"{file.path}: meshes[{index}].primitives[{number}]"
         primitive = validated(_Primitive, value, where)
@@ -312,13 +311,11 @@ def _with_comments(scene: GaussianScene, extras: Any) -> GaussianScene:
         for line in (lines if isinstance(lines, list) else ())
         if isinstance(line, str) and "\n" not in line
     ]
-    tagged = ANTIALIASED.is_in(comments)
-    own = () if tagged else scene.comments
+    own = () if ANTIALIASED.is_in(comments) else scene.comments
     return replace(scene, comments=(*own, *comments))
 
 
 def _moved(file: GltfFile, scene: GaussianScene, matrix: Matrix) -> GaussianScene:
-    """Transform Gaussians by the matrix of their node."""
     if np.array_equal(matrix, np.eye(4)):
         return scene
     with np.errstate(all="ignore"):

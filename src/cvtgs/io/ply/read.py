@@ -229,9 +229,9 @@ def _no_warnings(header: Header, elements: tuple[Element, ...]) -> AbstractConte
 
     Elsewhere, the filters of warnings, which belong to the whole process, stay as they are.
     """
-    has_lists = any(prop.count_type for element in elements for prop in element.properties)
-    is_text = header.encoding == "ascii"
-    return warnings.catch_warnings(action="ignore") if is_text and has_lists else nullcontext()
+    if header.encoding == "ascii" and any(element.has_lists for element in elements):
+        return warnings.catch_warnings(action="ignore")
+    return nullcontext()
 
 
 def _plain_header(header: Header, elements: tuple[Element, ...]) -> bytes:
