@@ -108,7 +108,7 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
     if not is_folder(folder):
         return folder
     with input_errors(folder):
-        found = next(_scenes(folder), None)
+        found = next(filter(is_file, _scenes(folder)), None)
     if found is None:
         raise InputError(
             f"{folder}: must be a file or the folder of a trained model, found a directory "
@@ -148,15 +148,15 @@ def scene_size(path: str | os.PathLike[str]) -> int:
 
 
 def _scenes(folder: Path) -> Iterator[Path]:
-    iterations = _numbered(folder / "point_cloud", _ITERATION)
-    yield from filter(is_file, (part / "point_cloud.ply" for part in iterations))
+    """Yield where the scene of a folder may be."""
+    for part in _numbered(folder / "point_cloud", _ITERATION):
+        yield part / "point_cloud.ply"
     for steps in (folder / "nerfstudio_models", folder):
-        yield from filter(is_file, _numbered(steps, _STEP))
+        yield from _numbered(steps, _STEP)
     for steps in (folder / "ckpts", folder):
-        yield from filter(is_file, _numbered(steps, _GSPLAT_STEP))
+        yield from _numbered(steps, _GSPLAT_STEP)
     for name in ("point_cloud.ply", "lod-meta.json", "meta.json"):
-        if is_file(folder / name):
-            yield folder / name
+        yield folder / name
 
 
 def _numbered(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
