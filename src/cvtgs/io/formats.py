@@ -4,9 +4,10 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, BinaryIO, Literal
+from typing import BinaryIO, Literal
 
 import numpy as np
 import torch
@@ -45,13 +46,8 @@ _READERS: Mapping[str, str] = {
     ".ckpt": "cvtgs.io.dicts:read_checkpoint",
     ".pt": "cvtgs.io.dicts:read_checkpoint",
 }
-"""Readers by suffix, imported when needed; the first suffix that fits counts."""
-
-_SIZED = (".compressed.ply", ".splat", ".ksplat")
-"""Formats besides plain PLY that store every row, so that ``trust_sizes`` does not apply."""
-
-_STREAM = "lod-meta.json"  # file name of a streamed SOG, the only format with several levels
-_STATES_AXES = (".spz", ".glb", ".gltf")  # formats whose readers convert axes themselves
+"""Readers by suffix, imported when needed; the first suffix that fits counts. Each takes the
+options of :func:`load` that its format has."""
 
 _FILE_AXES = {".spz.glb": "luf", ".glb": "luf", ".gltf": "luf", ".usda": "rub"}
 """Axes that a format prescribes, by suffix."""
@@ -159,23 +155,20 @@ def load(
         from cvtgs.io.ply.header import is_compressed_ply  # noqa: PLC0415 (loaded as readers are)
 
         suffix = ".compressed.ply" if is_compressed_ply(source) else ".ply"
-    options: dict[str, Any] = {} if suffix in _SIZED else {"trust_sizes": trust_sizes}
-    if suffix == ".ply":
-        options = {"sh_degree": sh_degree, "extras": extras}
-    elif suffix in _STATES_AXES:
-        options["axes"] = axes
-    if lod is not None and suffix == _STREAM:
-        options["lod"] = lod
-    elif lod not in (None, 0):
-        raise InvalidArgumentError(
-            f"lod must be 0 unless for a streamed SOG ({_STREAM}), found {lod!r} for {source}."
-        )
+    given = {"sh_degree": sh_degree, "extras": extras, "axes": axes, "trust_sizes": trust_sizes}
+    given["lod"] = 0 if lod is None else lod
     with memory_errors(f"{source}: reading the scene", BLOCKS_ADVICE):
         read: Callable[..., GaussianScene] = resolve_name(_READERS[suffix])
+        options = {name: given[name] for name in signature(read).parameters if name in given}
+        if lod not in (None, 0) and "lod" not in options:
+            raise InvalidArgumentError(
+                f"lod must be 0 unless for a streamed SOG (lod-meta.json), found {lod!r} for "
+                f"{source}."
+            )
         scene = read(source, **options)
-        if axes is not None and suffix not in _STATES_AXES:
+        if axes is not None and "axes" not in options:
             scene = change_axes(scene, axes, SCENE_AXES)
-        if suffix != ".ply" and sh_degree is not None and sh_degree < scene.sh_degree:
+        if "sh_degree" not in options and sh_degree is not None and sh_degree < scene.sh_degree:
             rest = scene.shN.clone()
             rest[:, REST_COUNTS[sh_degree] :] = 0.0
             scene = scene.with_tensors({"shN": rest})
