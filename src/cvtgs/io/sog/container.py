@@ -4,7 +4,8 @@ import io
 import os
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -28,13 +29,20 @@ PALETTE_COLUMNS = 64  # entries of the SH palette per row of its image
 Reader = Callable[[str, int], bytes]
 """Reads a file by its name; a file of more than the given number of bytes is an error."""
 
-StoredBytes = Callable[[Sequence[str]], int]
-"""Returns the size of files on disk in bytes, as compressed."""
 
-
-def open_container(path: Path) -> AbstractContextManager[tuple[Reader, StoredBytes]]:
+def open_container(path: Path) -> AbstractContextManager[Reader]:
     """Open a bundled or an unbundled SOG."""
-    return _beside(path) if is_index(path) else _inside(path)
+    return nullcontext(partial(_read_beside, path)) if is_index(path) else _inside(path)
+
+
+def stored_bytes(path: Path, names: Sequence[str]) -> int:
+    """Return the size of the images of a SOG on disk, as compressed."""
+    if not is_index(path):
+        return path.stat().st_size
+    for name in names:
+        _check_name(name, path)
+    parts = [path.with_name(name) for name in names]
+    return sum(part.stat().st_size for part in parts if is_file(part))
 
 
 def is_index(path: Path) -> bool:
@@ -42,28 +50,18 @@ def is_index(path: Path) -> bool:
     return path.suffix.lower() == ".json"
 
 
-@contextmanager
-def _beside(path: Path) -> Iterator[tuple[Reader, StoredBytes]]:
-    def read(name: str, most: int) -> bytes:
-        _check_name(name, path)
-        part = path if name == META else path.with_name(name)
-        with open_input(part) as file:
-            size = os.fstat(file.fileno()).st_size
-            if size > most:
-                raise _too_long(f"{part}", most, size)
-            return file.read()
-
-    def stored(names: Sequence[str]) -> int:
-        for name in names:
-            _check_name(name, path)
-        parts = [path.with_name(name) for name in names]
-        return sum(part.stat().st_size for part in parts if is_file(part))
-
-    yield read, stored
+def _read_beside(path: Path, name: str, most: int) -> bytes:
+    _check_name(name, path)
+    part = path if name == META else path.with_name(name)
+    with open_input(part) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most:
+            raise _too_long(str(part), most, size)
+        return file.read()
 
 
 @contextmanager
-def _inside(path: Path) -> Iterator[tuple[Reader, StoredBytes]]:
+def _inside(path: Path) -> Iterator[Reader]:
     with open_input(path) as file:
         no_zip = f"{path}: a .sog file must be a zip of meta.json and images, found no zip"
         with _damage_named(no_zip):
@@ -87,7 +85,7 @@ def _inside(path: Path) -> Iterator[tuple[Reader, StoredBytes]]:
                     return member.read(most)
 
         with archive:
-            yield read, lambda names: os.fstat(file.fileno()).st_size
+            yield read
 
 
 @contextmanager

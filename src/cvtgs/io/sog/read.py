@@ -27,10 +27,10 @@ from cvtgs.io.sog.container import (
     PALETTE_COLUMNS,
     QUAT_TAG,
     Reader,
-    StoredBytes,
     decode_webp,
     is_index,
     open_container,
+    stored_bytes,
 )
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
@@ -156,12 +156,12 @@ def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
         FileFormatError: It is not a SOG, or damaged.
     """
     # A damaged file may hold numbers beyond float32.
-    with open_container(path) as (read, stored), np.errstate(all="ignore"):
+    with open_container(path) as read, np.errstate(all="ignore"):
         where = str(path) if is_index(path) else f"{path}: {META}"
         meta = _read_meta(parse_json(read(META, MOST_META_BYTES), where), where)
         document = meta.document
         if not trust_sizes:
-            _check_expansion(meta, stored, path)
+            _check_expansion(meta, path)
         images = _Images(read=read, count=meta.count, path=path)
         means = _means(images, document.means)
         quats = _quats(images.rows(document.quats.files[0]))
@@ -184,12 +184,13 @@ def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
     return scene_of(arrays, antialiased=antialiased)
 
 
-def _check_expansion(meta: _Meta, stored: StoredBytes, path: Path) -> None:
+def _check_expansion(meta: _Meta, path: Path) -> None:
     document, rest = meta.document, meta.document.shN
     parts = (document.means, document.scales, document.quats, document.sh0, rest)
     names = {name for part in parts if part is not None for name in part.files}
     degree = 0 if rest is None else rest.bands if isinstance(rest, _Palette) else 3
-    check_expansion(path, count=meta.count, sh_degree=degree, stored=stored(sorted(names)))
+    stored = stored_bytes(path, sorted(names))
+    check_expansion(path, count=meta.count, sh_degree=degree, stored=stored)
 
 
 def _read_meta(content: Any, where: str) -> _Meta:
