@@ -53,7 +53,7 @@ _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 """Properties of a vertex, 32 bits each."""
 
 _THREE_BITS = (11, 10, 11)  # bits of positions and scales
-_COLOR_BITS = (8, 8, 8, 8)  # bits of red, green, blue and opacity
+_COLOR_BITS = (8, 8, 8)  # bits of red, green and blue; the last 8 are those of the opacity
 
 _QUAT_BITS = (10, 10, 10)
 """Bits of the three smaller components of a rotation; the top two bits index the missing one."""
@@ -84,7 +84,6 @@ def read_compressed_ply(path: Path) -> GaussianScene:
 def _unpacked(tables: dict[str, Rows]) -> Arrays:
     ranges = _ranges(tables["chunk"])
     places, rotations, scales, rgba = (tables["vertex"][name] for name in _PACKED)
-    colors = _unpack(rgba, _COLOR_BITS)
     opacities = (rgba & np.uint32(255)).astype(np.uint8)
     largest = (rotations >> np.uint32(30)).astype(np.int64)
     others = (_unpack(rotations, _QUAT_BITS) - np.float32(0.5)) * np.sqrt(np.float32(2))
@@ -93,7 +92,7 @@ def _unpacked(tables: dict[str, Rows]) -> Arrays:
         quats=restore_largest(largest, others),
         log_scales=_between(ranges[:, 6:12], _unpack(scales, _THREE_BITS)),
         logit_opacities=logits_of_bytes(opacities),
-        sh0=sh0_of_colors(_between(ranges[:, 12:18], colors[:, :3])),
+        sh0=sh0_of_colors(_between(ranges[:, 12:18], _unpack(rgba >> np.uint32(8), _COLOR_BITS))),
         shN=_rest(tables.get("sh"), len(places)),
     )
 
@@ -237,7 +236,7 @@ def _packed(
         _pack(place, _THREE_BITS),
         largest.astype(np.uint32) << np.uint32(30) | _pack(others * HALF_RANGE + 0.5, _QUAT_BITS),
         _pack(scale, _THREE_BITS),
-        _pack(color, _COLOR_BITS[:3]) << np.uint32(8) | opacities,
+        _pack(color, _COLOR_BITS) << np.uint32(8) | opacities,
     ]
     return np.concatenate([place_range, scale_range, color_range], axis=1), np.stack(words, axis=1)
 
