@@ -38,8 +38,8 @@ class Losses:
 class FormatLimits:
     """The limits of files of a format."""
 
-    sh_degree: int
-    antialiased: bool
+    sh_degree: int = 3
+    antialiased: bool = True
     """Whether files record that a scene was trained with anti-aliasing."""
     comments: bool = False
     two_scales: bool = False
@@ -59,8 +59,6 @@ _USUAL_SPZ_STEP = 1 / 4096
 _SPZ_ROTATIONS = "rotations in steps of 1/723 per component"
 
 _SPZ = FormatLimits(  # of versions 3 and 4
-    sh_degree=3,
-    antialiased=True,
     ranges={
         "log_scales": (-10 - 1 / 32, 255 / 16 - 10 + 1 / 32),
         "sh0": (-3.3464, 3.3464),
@@ -88,8 +86,6 @@ SPZ_2 = replace(
 """What a ``.spz`` of version 2 loses."""
 
 _GLTF = FormatLimits(
-    sh_degree=3,
-    antialiased=True,
     comments=True,
     ranges={"log_scales": SCALE_RANGE},  # scales are stored as float32
     changed=("scales and opacities as float32 instead of their logarithms and logits",),
@@ -97,8 +93,6 @@ _GLTF = FormatLimits(
 
 FORMAT_LIMITS: Mapping[str, FormatLimits] = {
     ".compressed.ply": FormatLimits(
-        sh_degree=3,
-        antialiased=True,
         comments=True,
         ranges={"log_scales": (-20.0, 20.0), "shN": (-4.0, 4.0)},
         changed=(
@@ -126,8 +120,6 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = {
         ),
     ),
     ".sog": FormatLimits(
-        sh_degree=3,
-        antialiased=True,
         two_scales=True,
         changed=(
             "rows in Morton order",
