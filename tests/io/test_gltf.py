@@ -8,6 +8,7 @@ import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import pytest
 import torch
@@ -211,11 +212,12 @@ def test_quantized_positions_are_placed_by_their_node(small: Path, normalized: b
 def test_buffers_are_read_from_the_folder_of_the_file_only(small: Path, tmp_path: Path) -> None:
     document, binary = parts(small.read_bytes())
     (tmp_path / "in").mkdir()
-    (tmp_path / "in" / "some data.bin").write_bytes(binary)
-    document["buffers"][0]["uri"] = "in/some%20data.bin"
     path = tmp_path / "a.gltf"
-    path.write_text(json.dumps(document))
-    assert same_bits(load(path), load(small))
+    for name in ("some data.bin", "\u6587" * 40 + ".bin"):  # nine characters each in a URI
+        (tmp_path / "in" / name).write_bytes(binary)
+        document["buffers"][0]["uri"] = quote(f"in/{name}")
+        path.write_text(json.dumps(document))
+        assert same_bits(load(path), load(small))
     outside = ("../x.bin", "/etc/passwd", "http://x.org/a.bin", "a\\b.bin", "..%2Fx.bin", "")
     for uri in (*outside, "C%3A/x.bin"):  # on Windows, a file on another drive
         document["buffers"][0]["uri"] = uri

@@ -236,7 +236,7 @@ class GltfFile:
 
     def _beside(self, uri: str, index: int, length: int) -> bytes:
         name = unquote(uri)
-        if not is_within(name) or len(uri) > LONGEST_NAME:  # such as a damaged data URI
+        if not is_within(name) or len(name) > LONGEST_NAME:  # such as a damaged data URI
             raise self.error(
                 f"buffers[{index}] must be in the folder of the file, found {shown(uri)}"
             )
