@@ -227,10 +227,25 @@ def test_text_files_and_closed_files_are_refused(tmp_path: Path) -> None:
         cvtgs.save(scene, file)
 
 
+def test_an_error_of_a_sink_is_one_of_outputs() -> None:
+    for error, found in ((RuntimeError("Out of quota."), "out of quota"), (EOFError(), "EOFError")):
+        with pytest.raises(OutputError, match=f"all bytes, found: {found}\\.$") as raised:
+            cvtgs.save(storable_scene(5), Cut(error), format=".ply")
+        assert raised.value.__cause__ is error
+    with pytest.raises(MemoryError):
+        cvtgs.save(storable_scene(5), Cut(MemoryError()), format=".ply")
+
+
 class Cut(io.RawIOBase):
     """A connection that breaks, with an error of its own kind."""
 
     name = ""
+
+    def __init__(self, error: Exception | None = None) -> None:
+        self.error = error
+
+    def write(self, _: object) -> int:
+        raise self.error or EOFError
 
     def read(self, size: int = -1) -> bytes:
         raise EOFError("the stream ended too early")

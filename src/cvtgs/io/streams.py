@@ -144,11 +144,13 @@ def written_to(stream: ByteSink) -> Iterator[BinaryIO]:
         try:
             copy_to(stream, cast(BinaryIO, file))
             getattr(stream, "flush", lambda: None)()
-        except (TypeError, ValueError, OSError) as error:  # ValueError: closed, or for reading
+        except MemoryError:
+            raise
+        except Exception as error:  # connections raise their own kinds
             found = reason_of(error).rstrip(".")
             raise OutputError(
                 f"{name_of(stream)}: must be open for writing in binary mode and take all bytes, "
-                f"found: {found}."
+                f"found: {found or type(error).__name__}."
             ) from error
 
 
