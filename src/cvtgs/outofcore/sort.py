@@ -3,7 +3,7 @@
 import json
 import secrets
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -57,30 +57,21 @@ class Attempt:
     """
 
     def __init__(self, folder: str) -> None:
-        self._folder = Path(folder)
-        self._token = secrets.token_hex(8)
-        self._found: dict[str, tuple[int, int]] = {}
+        self.files = dict[str, SortedFile]()  # by final name
+        self._folder, self._token = Path(folder), secrets.token_hex(8)
 
     def append(self, name: str, content: bytes) -> None:
         """Append to the file with this final name."""
-        path = self._folder / self._name(name)
+        new = SortedFile(name, f"attempt_{name}_{self._token}", 0, 0)
+        file = self.files.get(name, new)
+        path = self._folder / file.attempt
         try:
-            with path.open("ab") as file:
-                file.write(content)
+            with path.open("ab") as opened:
+                opened.write(content)
         except OSError as error:
             raise write_error(path, error) from error
-        size, checksum = self._found.get(name, (0, 0))
-        self._found[name] = (size + len(content), zlib.crc32(content, checksum))
-
-    def files(self) -> tuple[SortedFile, ...]:
-        """Return the written files."""
-        return tuple(
-            SortedFile(name, self._name(name), size, checksum)
-            for name, (size, checksum) in self._found.items()
-        )
-
-    def _name(self, name: str) -> str:
-        return f"attempt_{name}_{self._token}"
+        size, checksum = file.size + len(content), zlib.crc32(content, file.checksum)
+        self.files[name] = file._replace(size=size, checksum=checksum)
 
 
 class SortedBlocks(NamedTuple):
@@ -152,7 +143,6 @@ def _sort(
     ranges: Sequence[RowRange],
     advance: Callable[[int], None],
 ) -> SortedBlocks:
-    """Sort all rows into blocks."""
     rows, cells, files = [0] * job.blocks, [0.0] * job.blocks, list[SortedFile]()
     left_out_mass = 0.0
     for part in with_progress(workers(partial(sort_range, job), ranges), advance):
@@ -175,7 +165,7 @@ class SortedCounts(NamedTuple):
     rows: list[int]
     cells: list[list[float]]
     left_out: list[float]
-    files: tuple[SortedFile, ...]
+    files: list[SortedFile]
 
 
 @one_thread()
@@ -215,7 +205,7 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
             if count:
                 name = job.rows_path(block, rows.number).name
                 attempt.append(name, table[end - count : end].tobytes())
-    return SortedCounts(row_counts.tolist(), cell_counts, left_out, attempt.files())
+    return SortedCounts(row_counts.tolist(), cell_counts, left_out, [*attempt.files.values()])
 
 
 def _filtered(
@@ -243,12 +233,11 @@ def _kept_rows(records: NDArray[Any], scene: GaussianScene, protected: Tensor) -
     return bytes(kept.tobytes())
 
 
-def _adopt(job: Job, files: Iterable[SortedFile]) -> None:
+def _adopt(job: Job, files: Sequence[SortedFile]) -> None:
     """Give the files of finished attempts their final names, and remove other attempts."""
-    adopted = list(files)
     for path in job.path("").glob("rows_*"):
         path.unlink()  # from an earlier sort with another filter
-    for file in adopted:
+    for file in files:
         path = job.path(file.attempt)
         found = f"{path.stat().st_size} bytes" if path.exists() else "no file"
         if found != f"{file.size} bytes":
@@ -259,5 +248,5 @@ def _adopt(job: Job, files: Iterable[SortedFile]) -> None:
         replace_file(path, job.path(file.name))
     for path in job.path("").glob("attempt_*"):
         path.unlink(missing_ok=True)
-    facts = {file.name: (file.size, file.checksum) for file in adopted}
+    facts = {file.name: (file.size, file.checksum) for file in files}
     job.write_file("sorted.json", json.dumps(facts).encode())
