@@ -65,26 +65,25 @@ def partition_space(
     points: Float[Tensor, "n 3"], measure: Float[Tensor, "n"], count: int
 ) -> KdPartition:
     """Split space into blocks of equal measure, each time along the axis of largest variance."""
-    axes, thresholds, children, leaves = list[int](), list[float](), list[list[int]](), 0
+    axes, thresholds, children = list[int](), list[float](), list[list[int]]()
 
-    def split(rows: Tensor, blocks: int) -> int:
-        nonlocal leaves
+    def split(rows: Tensor, first: int, blocks: int) -> int:
+        """Split rows into some blocks from a first one on; return their node."""
         if blocks == 1:
-            leaves += 1
-            return -leaves
-        node = len(axes)
+            return -1 - first
+        node, half = len(axes), blocks // 2
         part, weights = points[rows], measure[rows]
         axis = _widest_axis(part, weights)
-        threshold = _weighted_quantile(part[:, axis], weights, (blocks // 2) / blocks)
+        threshold = _weighted_quantile(part[:, axis], weights, half / blocks)
         axes.append(axis)
         thresholds.append(threshold)
-        children.append([0, 0])
+        children.append([])
         left = part[:, axis] < threshold
-        children[node][0] = split(rows[left], blocks // 2)
-        children[node][1] = split(rows[~left], blocks - blocks // 2)
+        below = split(rows[left], first, half)
+        children[node] = [below, split(rows[~left], first + half, blocks - half)]
         return node
 
-    split(torch.arange(len(points)), count)
+    split(torch.arange(len(points)), 0, count)
     return KdPartition(
         axes=torch.tensor(axes, dtype=torch.int64),
         thresholds=torch.tensor(thresholds, dtype=torch.float64),
@@ -182,9 +181,10 @@ def read_sample(source: PlyRows, count: int) -> GaussianScene:
     """
     step = max(1, source.count // count)
     rows = step * max(1, CHUNK // step)
-    starts = range(0, source.count, rows)
-    ends = (min(start + rows, source.count) for start in starts)
-    parts = (_one_of(source.read(*span), step) for span in zip(starts, ends, strict=True))
+    parts = (
+        _one_of(source.read(start, min(start + rows, source.count)), step)
+        for start in range(0, source.count, rows)
+    )
     return validity.valid_part(source.assemble(parts, -(-source.count // step)))
 
 
