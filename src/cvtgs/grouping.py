@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs import cells, cvt
-from cvtgs.analysis import SceneAnalysis
+from cvtgs.analysis import EffectPlan, SceneAnalysis
 from cvtgs.config import AllocationConfig, SimplifyConfig
 from cvtgs.counts import checked_whole
 from cvtgs.cvt.nearest import search_device
@@ -174,7 +174,7 @@ def tessellate_rows(
     if count == len(rows):  # every Gaussian is its own cell, so the space does not matter
         space = scene.means.index_select(0, rows)
     else:
-        space = embed_rows(scene, rows, analysis, target, config)
+        space = embed_rows(scene, rows, target, config, frame=analysis.frame, plan=analysis.plan)
     return cvt.tessellate(
         space,
         points.weights,
@@ -297,16 +297,18 @@ def curve_order(
 def embed_rows(
     scene: GaussianScene,
     rows: Int[Tensor, "k"],
-    analysis: SceneAnalysis,
     target: int,
     config: SimplifyConfig,
+    *,
+    frame: RobustFrame,
+    plan: EffectPlan,
 ) -> Float[Tensor, "k d"]:
     """Embed Gaussians in the space of the tessellation; colour counts more with fewer cells."""
     return cvt.embed(
         scene.means.index_select(0, rows),
         scene.sh0.index_select(0, rows),
-        frame=analysis.frame,
-        contraction=analysis.plan.unbounded.strength,
+        frame=frame,
+        contraction=plan.unbounded.strength,
         color=config.cvt.color * (target / COLOR_CELLS) ** config.cvt.color_power,
     )
 

@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.analysis import SceneAnalysis
 from cvtgs.cvt import choose_seeds, gaussian_weights, nearest_site
 from cvtgs.cvt.nearest import search_once_per_position
 from cvtgs.cvt.tessellate import centroids, sample_points, weighted_sums
@@ -173,24 +172,15 @@ def _embedded_rows(
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n d"], Float[Tensor, "n"]]:
     """Return rows of a block along a Morton curve or in a given order, embedded, and weights."""
     scan = job.read_scan()
-    scene, areas, visibility = read_apparent_rows(job, block)
-    analysis = SceneAnalysis(
-        frame=scan.frame,
-        farthest=0.0,  # flyaways are already left out
-        opacities=scene.opacities,
-        areas=areas[:0],  # the tessellation uses apparent areas only
-        apparent_areas=areas,
-        visibility=visibility,
-        plan=scan.plan,
-    )
+    scene, areas, _ = read_apparent_rows(job, block)
+    opacities = scene.opacities
     if order is None:
         everything = torch.arange(len(scene))
-        masses = areas * analysis.opacities
-        order = curve_order(scene, everything, scan.frame, masses=masses).int()
-    rows = order.long()
-    points = embed_rows(scene, rows, analysis, job.read_manifest().total, job.config)
+        order = curve_order(scene, everything, scan.frame, masses=areas * opacities).int()
+    rows, total = order.long(), job.read_manifest().total
+    points = embed_rows(scene, rows, total, job.config, frame=scan.frame, plan=scan.plan)
     config = job.config.cvt
-    weights = gaussian_weights(analysis.opacities[rows], areas[rows], area_power=config.area_power)
+    weights = gaussian_weights(opacities[rows], areas[rows], area_power=config.area_power)
     weights = (weights / scan.mean_weight).clamp_min(config.weight_floor)
     return order, points, weights
 
