@@ -236,21 +236,18 @@ def step_gradients(
             _case_gradient(net, cases, config, copies, step, number) for number in numbers
         ]
         return
-    text = config.model_dump_json()
     with LocalWorkers(processes, "with --resume and OMP_NUM_THREADS=1") as workers:
-        yield lambda net, step: list(workers(partial(_compute, text, cache, net, step), numbers))
+        yield lambda net, step: list(workers(partial(_compute, config, cache, net, step), numbers))
 
 
-def _compute(config_text: str, cache: Path, net: Net, step: int, number: int) -> CaseGradient:
+def _compute(config: TrainConfig, cache: Path, net: Net, step: int, number: int) -> CaseGradient:
     """Compute the gradients of a case in another process."""
-    config = TrainConfig.model_validate_json(config_text)
-    cases, copies = _training_cases(config_text, cache), DeviceCopies(torch.device("cpu"))
+    cases, copies = _training_cases(config, cache), DeviceCopies(torch.device("cpu"))
     return _case_gradient(net, cases, config, copies, step, number)
 
 
 @lru_cache(maxsize=1)
-def _training_cases(config_text: str, cache: Path) -> list[CaseWithViews]:
-    config = TrainConfig.model_validate_json(config_text)
+def _training_cases(config: TrainConfig, cache: Path) -> list[CaseWithViews]:
     sources = find_sources(config.data, seed=config.seed)
     scenes = [prepare_scene(one, config, cache) for one in sources if not one.is_validation]
     return [(case, scene.views) for scene in scenes for case in scene.cases]
