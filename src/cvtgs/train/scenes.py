@@ -121,8 +121,8 @@ def _from_files(
     for path in files:
         count, name = len(load(path)), path.stem
         sha256, is_validation = _digest(path), name in held_out
-        cameras = path.with_suffix(".transforms.json") if is_validation else None
-        cameras = cameras if cameras is not None and cameras.is_file() else None
+        beside = path.with_suffix(".transforms.json")
+        cameras = beside if is_validation and beside.is_file() else None
         whole = Source(
             name=name,
             identity=sha256,
