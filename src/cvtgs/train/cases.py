@@ -10,7 +10,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.analysis import analyze, drop_unused_bands
-from cvtgs.analysis.analyze import measure_contributions
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Descriptors, Partition, describe_cells
 from cvtgs.clock import StageClock
@@ -44,15 +43,13 @@ class MergedScene(NamedTuple):
 
 
 def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> MergedScene:
-    """Run all stages before the network; ``target`` must be below the number of valid Gaussians."""
+    """Run all stages before the network, without images; ``target`` is below the valid count."""
     valid = check_rows(scene).scene
     if target >= len(valid):
         raise InvalidArgumentError(
             f"target must be below the {len(valid)} valid Gaussians, found {target}."
         )
     analysis = analyze(valid, config, with_visibility=True)
-    if analysis.plan.visibility.active:
-        analysis = measure_contributions(valid, analysis, config)
     valid = drop_unused_bands(valid, analysis.plan)
     clock = StageClock(silent, valid.device)
     merged = group_and_merge(valid, analysis, target, config, with_network=True, clock=clock)[0]
