@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -258,12 +258,10 @@ def _read_cached(path: Path, key: Mapping[str, str]) -> CostModel | None:
 
 def measured_seconds(device: str | torch.device) -> StageSeconds:
     """Return a function that simplifies a scene and returns the seconds of each stage."""
-    simplifiers: dict[SimplifyConfig, Simplifier] = {}
+    simplifier = cache(partial(Simplifier, device=device))
 
     def run(config: SimplifyConfig, scene: GaussianScene, count: int) -> Mapping[str, float]:
-        if config not in simplifiers:
-            simplifiers[config] = Simplifier(config=config, device=device)
-        report = simplifiers[config].run(scene, count=count).report
+        report = simplifier(config=config).run(scene, count=count).report
         return {cost.stage: undisturbed_seconds(cost) for cost in report.stages}
 
     return run
