@@ -168,10 +168,7 @@ def encode_checkpoint(net: Net, info: CheckpointInfo) -> bytes:
         >>> len(encode_checkpoint(MergeNet(info.architecture), info)) < 200_000
         True
     """
-    tensors = {
-        name: values.detach().to(torch.float32).cpu().contiguous()
-        for name, values in net.state_dict().items()
-    }
+    tensors = {name: values.float() for name, values in net.state_dict().items()}
     described = info.model_dump_json()
     metadata = {
         "format": FORMAT,
