@@ -300,14 +300,17 @@ def calibrate(
     """
     made = cache(make)
     scenes = [made(trial.kind, trial.count, sh_degree=trial.sh_degree) for trial in trials]
+    works = [
+        Work.of(scene, target_count(len(scene), trial.rho))
+        for trial, scene in zip(trials, scenes, strict=True)
+    ]
     total, begun = MOST_REPEATS * len(trials), cpu()
 
     def measure(row: int, done: int, text: str) -> Mapping[str, float]:
-        trial, scene = trials[row], scenes[row]
-        count = target_count(len(scene), trial.rho)
-        note = f"{text} {trial.preset}, {len(scene):,} to {count:,} Gaussians"
+        trial, work = trials[row], works[row]
+        note = f"{text} {trial.preset}, {work.count:,} to {work.target:,} Gaussians"
         listener(ProgressEvent(stage=STAGE, done=done, total=total, note=note))
-        return run(trial.config, scene, count)
+        return run(trial.config, scenes[row], work.target)
 
     first = {trials[row].config.uses_images: row for row in reversed(range(len(trials)))}
     loading = {row: sum(measure(row, 0, "load preset").values()) for row in sorted(first.values())}
@@ -324,18 +327,12 @@ def calibrate(
             spent[row] += clock() - begin
         listener(ProgressEvent(stage=STAGE, done=number + 1, total=total))
     prior = prior or shipped_model()
-    taken = {trial.name: stages for trial, stages in zip(trials, best, strict=True) if stages}
-    measured = [
-        Measurement(
-            work=Work.of(scene, target_count(len(scene), trial.rho)),
-            config=trial.config,
-            seconds=taken[trial.name],
-        )
-        for trial, scene in zip(trials, scenes, strict=True)
-        if trial.name in taken
-    ]
-    there = [prior.trials.get(name, {}) for name in taken]
-    measured = [_without_misfit(*pair, prior) for pair in zip(measured, there, strict=True)]
+    taken, measured = dict[str, dict[str, float]](), list[Measurement]()
+    for trial, work, stages in zip(trials, works, best, strict=True):
+        if stages:
+            taken[trial.name] = stages
+            here = Measurement(work=work, config=trial.config, seconds=stages)
+            measured.append(_without_misfit(here, prior.trials.get(trial.name, {}), prior))
     starts = {
         with_images: min(max(loading[row] - sum(best[row].values()), 0.0), MOST_START_SECONDS)
         for with_images, row in first.items()
