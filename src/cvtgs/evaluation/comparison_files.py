@@ -98,8 +98,7 @@ def write_comparison(
     listener(ProgressEvent(stage=STAGE, done=0, total=len(makers)))
     paths = tuple(Path(folder) / name for name in makers)
     for done, (path, make) in enumerate(zip(paths, makers.values(), strict=True), start=1):
-        content = make()
-        write_atomically(path, content, overwrite=overwrite)
+        write_atomically(path, make(), overwrite=overwrite)
         listener(ProgressEvent(stage=STAGE, done=done, total=len(makers)))
     return paths
 
