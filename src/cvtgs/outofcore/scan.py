@@ -93,8 +93,6 @@ def partition_space(
 
 
 def _widest_axis(points: Tensor, weights: Tensor) -> int:
-    if len(points) == 0:
-        return 0
     shares = (weights / weights.sum().clamp_min(1e-300))[:, None]
     variance = (shares * (points - (shares * points).sum(dim=0)).square()).sum(dim=0)
     return int(variance.argmax())
@@ -350,9 +348,7 @@ def _cell_weight(weights: Float[Tensor, "n"], cells: float) -> float:
     low, high = 0.0, float(weights.sum())
     for _ in range(100):
         middle = (low + high) / 2
-        if middle <= 0.0:
-            return 0.0
-        if float((weights / middle).clamp_max(1.0).sum()) > cells:
+        if float(in_cells(weights, middle).sum()) > cells:
             low = middle
         else:
             high = middle
