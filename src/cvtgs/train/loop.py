@@ -145,8 +145,7 @@ def train(
         _restore_checkpoint(state, config, files)
     make_folder(files.cache)
     cases, validation_scenes = _prepare_scenes(sources, config, files.cache, listener)
-    if config.kind != "published":
-        state.learn_range(summarize(case.descriptors) for case, _ in cases)
+    state.learn_range(summarize(case.descriptors) for case, _ in cases)
     copies = DeviceCopies(device)
     if not state.history.validations:
         _validate(state, validation_scenes, math.nan, config, files, copies)

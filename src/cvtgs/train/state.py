@@ -225,7 +225,7 @@ class TrainState:
         self.averaged_steps = config.averaged_steps
 
     def learn_range(self, cases: Iterable[Tensor]) -> None:
-        """Fit the known range of both networks to the summaries of all cases."""
+        """Fit the known range of both networks, if they have one, to the summaries of all cases."""
         if isinstance(self.net, MergeNet) and isinstance(self.mean_net, MergeNet):
             self.net.known.fit(cases)
             self.mean_net.known.load_state_dict(self.net.known.state_dict())
