@@ -256,7 +256,7 @@ def _run_blocks(job: Job, workers: Workers, clock: StageClock) -> int:
         steps["images"] = improve
     for name, step in steps.items():
         with clock.stage(name, len(with_cells)) as advance:
-            _run_all(workers, partial(step, job), with_cells, advance)
+            list(with_progress(workers(partial(step, job), with_cells), advance))
     return resumed
 
 
@@ -269,13 +269,14 @@ def _group(job: Job, workers: Workers, clock: StageClock) -> tuple[float, ...]:
     blocks, iterations = job.blocks_with_rows(), job.config.cvt.iterations
     if job.config.uses_renders:
         with clock.stage("visibility", len(blocks)) as advance:
-            _run_all(workers, partial(measure, job), blocks, advance)
+            list(with_progress(workers(partial(measure, job), blocks), advance))
             add_contributions(job)
     with clock.stage("tessellate", (iterations + 2) * len(blocks)) as advance:
 
         def run(step: Callable[[int], Result], nth: int) -> list[Result]:
             first = nth * len(blocks)
-            return _run_all(workers, step, blocks, lambda done: advance(first + done))
+            results = workers(step, blocks)
+            return list(with_progress(results, lambda done: advance(first + done)))
 
         run(partial(seed, job), 0)
         moves, energies, least = 0, [math.inf], 1.0 - job.config.cvt.tolerance
@@ -288,17 +289,8 @@ def _group(job: Job, workers: Workers, clock: StageClock) -> tuple[float, ...]:
         run(partial(assign, job, moves), iterations + 1)
     with clock.stage("allocate", len(blocks)) as advance:
         allocate(job)
-        _run_all(workers, partial(join, job), blocks, advance)
+        list(with_progress(workers(partial(join, job), blocks), advance))
     return tuple(energies[1:])
-
-
-def _run_all(
-    workers: Workers,
-    step: Callable[[int], Result],
-    blocks: Sequence[int],
-    advance: Callable[[int], None],
-) -> list[Result]:
-    return list(with_progress(workers(step, blocks), advance))
 
 
 def assemble_blocks(
