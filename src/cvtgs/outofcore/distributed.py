@@ -191,7 +191,6 @@ class ClusterWorkers:
         return addresses
 
     def _addresses(self) -> list[str]:
-        """Return the addresses of all workers."""
         return sorted(self._client.scheduler_info(n_workers=-1)["workers"])
 
     def __call__(

@@ -71,7 +71,6 @@ class Balls:
 
 
 def _run_maxima(values: Float[Tensor, "n"]) -> Float[Tensor, "r"]:
-    """Return the largest value of every run."""
     missing = -len(values) % RUN
     padded = torch.cat([values, values[-1:].expand(missing)])
     largest: Tensor = padded.unflatten(0, (-1, RUN)).amax(dim=1)

@@ -92,7 +92,6 @@ def _packed(cameras: Cameras) -> dict[str, Tensor]:
 
 
 def _scene_views(job: Job) -> dict[str, Cameras]:
-    """Read the views of the whole scene."""
     tensors, found = map_tensors(job.views_path)[0], dict[str, Cameras]()
     for name in (SEEN, LATER):
         own = under_prefix(name, tensors)

@@ -107,7 +107,6 @@ def _remote_sums(job: Job, iteration: int) -> dict[int, RemoteSums]:
 
 
 def _centroids(job: Job, iteration: int, block: int, remote: RemoteSums) -> Tensor:
-    """Return the centroids of the sites of a block."""
     tensors = job.read("sums", block, iteration)
     sites = job.read("sites", block, iteration)["sites"]
     totals = tensors["totals"].index_add(0, remote.numbers, remote.totals)
