@@ -1,5 +1,6 @@
 """Blocks are matched and refined while the others are rendered but fixed: no seams, same bits."""
 
+import os
 import warnings
 from typing import Any
 
@@ -232,3 +233,21 @@ def test_refinement_in_blocks_gains_and_keeps_protected_gaussians(scene, source,
     assert report.refinement.psnr_after > report.refinement.psnr_before
     first = small.select(torch.arange(len(kept)))
     assert all(torch.equal(a, kept.tensors()[name]) for name, a in first.tensors().items())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["small", "improved", "targets"])
+def test_reports_are_whole_after_damage_to_files_of_finished_blocks(source, tmp_path, kind):
+    def stop(event):
+        if event.stage == "assemble":
+            raise KeyboardInterrupt
+
+    output, whole = tmp_path / "out.ply", tmp_path / "whole.ply"
+    wanted = in_blocks(source, whole, MATCHED)
+    with pytest.raises(KeyboardInterrupt):
+        in_blocks(source, output, MATCHED, listener=stop)
+    path = max(tmp_path.glob(f".out.ply.blocks/*/{kind}[._]*"), key=lambda path: path.suffix)
+    os.truncate(path, path.stat().st_size - 5)
+    found = in_blocks(source, output, MATCHED)
+    assert output.read_bytes() == whole.read_bytes()
+    assert (found.matching, found.mass_out) == (wanted.matching, wanted.mass_out)

@@ -7,7 +7,6 @@ import shutil
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -299,18 +298,21 @@ class Job:
         try:
             blocks = self.blocks_with_cells()
         except (OSError, ValueError, TypeError):  # blocks cannot be checked without it
-            for path in (self.path("targets.json"), *self.path("").glob("small_*")):
-                path.unlink(missing_ok=True)
+            for pattern in ("targets.json", "small_*", "improved_*"):
+                for path in self.path("").glob(pattern):
+                    path.unlink()
             return
-        for block, is_improved in product(blocks, (False, True)):
-            name = self.improved_path(block) if is_improved else self.small_path(block)
-            try:
-                json.loads(self.report_path(block).read_bytes())
-                whole = open_rows(name).count == self.targets[block]
-            except (CvtgsError, OSError, ValueError):
-                whole = False
-            if not whole:
-                name.unlink(missing_ok=True)
+        for block in blocks:
+            whole = True
+            # The report of a small block that is made again would lack what its images changed.
+            for name in (self.small_path(block), self.improved_path(block)):
+                try:
+                    json.loads(self.report_path(block).read_bytes())
+                    whole = whole and open_rows(name).count == self.targets[block]
+                except (CvtgsError, OSError, ValueError):
+                    whole = False
+                if not whole:
+                    name.unlink(missing_ok=True)
 
 
 def _listed(cameras: Cameras) -> list[object]:
