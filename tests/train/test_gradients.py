@@ -118,5 +118,6 @@ def test_a_bad_loss_names_its_own_scene(scenes, cache, tmp_path, monkeypatch):
         return loss * math.nan if case.scene_name == "third" else loss
 
     monkeypatch.setattr(train_loop, "scene_loss", spoilt)
+    monkeypatch.setattr(train_loop, "thread_count", lambda: 1)  # no processes, which have their own
     with pytest.raises(TrainingError, match="third at"):
         run(config_of(scenes, cases_per_step=3, steps=20), tmp_path / "net.safetensors", cache)
