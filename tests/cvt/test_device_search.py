@@ -192,9 +192,9 @@ def test_several_sites_at_one_position_are_all_found():
 def test_a_search_among_sites_at_one_position_looks_at_one(monkeypatch):
     searched = []
 
-    def search(points, sites):
+    def search(points, sites, count):
         searched.append(len(sites))
-        return nearest_in_tiles(points, sites)
+        return nearest_in_tiles(points, sites, count)
 
     monkeypatch.setattr(nearest, "nearest_in_tiles", search)
     points, sites = cloud(100, 3), torch.cat([torch.zeros(500, 3), torch.ones(1, 3)]).double()

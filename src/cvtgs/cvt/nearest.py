@@ -1,9 +1,8 @@
 """Nearest sites and neighbours: by scipy's k-d tree on the host, or in tiles on CUDA."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from torch import Tensor
 from cvtgs.checks import checked
 from cvtgs.counts import checked_whole
 from cvtgs.cvt.device_search import nearest_in_tiles
-from cvtgs.devices import HOST, thread_count
+from cvtgs.devices import HOST, row_chunks, thread_count
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.frames import robust_frame
 from cvtgs.math.segments import ascending_rows
@@ -60,12 +59,7 @@ def nearest_site(
         >>> labels.tolist()
         [1]
     """
-    if points.device.type != "cuda":
-        return nearest_scipy(points, sites)
-    _check_sites(sites)
-    distinct = _one_of_each(sites)
-    labels, squared = nearest_in_tiles(points, sites if distinct is None else sites[distinct])
-    return labels[:, 0] if distinct is None else distinct[labels[:, 0]], squared[:, 0]
+    return _nearest_distinct(points, sites, search_device(points.device))
 
 
 @checked
@@ -94,22 +88,20 @@ def nearest_scipy(
         >>> labels.tolist()
         [1]
     """
+    return _nearest_distinct(points, sites, HOST)
+
+
+def _nearest_distinct(
+    points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], device: torch.device
+) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
+    """Search on a device, with one site of every position: trees cannot separate the others."""
     _check_sites(sites)
-    device, points, sites = points.device, points.detach().cpu(), sites.detach().cpu()
-    distinct = _one_of_each(sites)
-    tree = build_tree(sites if distinct is None else sites[distinct])
-    labels = np.empty(len(points), dtype=np.int64)
-    squared = np.empty(len(points), dtype=np.float64)
-
-    def search(part: slice) -> None:
-        distances, labels[part] = tree.query(points[part].double().numpy())
-        np.square(distances, out=squared[part])
-
-    _in_threads(search, len(points))
-    found = torch.from_numpy(labels)
-    if distinct is not None:
-        found = distinct[found]
-    return found.to(device), torch.from_numpy(squared).to(device)
+    home, points, sites = points.device, points.detach().to(device), sites.detach().to(device)
+    runs = runs_of_equal(sites)
+    distinct = None if runs is None else torch.sort(runs[0][runs[1] == 0]).values
+    found, squared = _nearest_apart(points, sites if distinct is None else sites[distinct], 1)
+    labels = found[:, 0] if distinct is None else distinct[found[:, 0]]
+    return labels.to(home), squared[:, 0].to(home)
 
 
 def _check_sites(sites: Float[Tensor, "m d"]) -> None:
@@ -119,38 +111,6 @@ def _check_sites(sites: Float[Tensor, "m d"]) -> None:
         )
 
 
-@contextmanager
-def _finite() -> Iterator[None]:
-    """Turn scipy's error about values that are not finite into one of cvtgs."""
-    try:
-        yield
-    except ValueError as error:
-        raise InvalidArgumentError(
-            "points and sites must be finite, found NaN or infinite coordinates."
-        ) from error
-
-
-def _one_of_each(sites: Float[Tensor, "m d"]) -> Int[Tensor, "k"] | None:
-    """Return one row of every position, since trees cannot separate the others; None for all."""
-    runs = runs_of_equal(sites)
-    return None if runs is None else torch.sort(runs[0][runs[1] == 0]).values
-
-
-@_finite()
-def _in_threads(search: Callable[[slice], None], count: int) -> None:
-    """Search all chunks of points, in as many threads as there are cores.
-
-    The threads are our own: an interrupt waits for them, but would leave scipy's own running.
-    """
-    if count <= CHUNK:
-        return search(slice(0, count))
-    parts = (slice(start, start + CHUNK) for start in range(0, count, CHUNK))
-    with ThreadPoolExecutor(thread_count()) as pool:
-        for _ in pool.map(search, parts):
-            pass
-
-
-@_finite()
 def build_tree(sites: Float[Tensor, "m d"]) -> Any:
     """Build scipy's k-d tree, split at the middles of boxes.
 
@@ -203,8 +163,8 @@ def nearest_several(
     apart = _apart(sites.detach().to(device))
     more = apart.shape[1] - points.shape[1]
     padded = torch.nn.functional.pad(points.detach().to(device).double(), (0, more))
-    rows, distances = _nearest_apart(padded, apart, min(count, len(sites)))
-    return rows.to(points.device), distances.to(points.device)
+    rows, squared = _nearest_apart(padded, apart, min(count, len(sites)))
+    return rows.to(points.device), squared.sqrt().to(points.device)
 
 
 def _apart(sites: Float[Tensor, "m d"]) -> Float[Tensor, "m e"]:
@@ -225,20 +185,34 @@ def _apart(sites: Float[Tensor, "m d"]) -> Float[Tensor, "m e"]:
 def _nearest_apart(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
-    """Find the nearest of sites that do not coincide, and their distances."""
+    """Find the nearest of sites that do not coincide, and their squared distances.
+
+    On the host, chunks of points are searched in as many threads as there are cores. The threads
+    are our own: an interrupt waits for them, but would leave scipy's own running.
+    """
     if sites.device.type == "cuda":
-        found, squared = nearest_in_tiles(points, sites, count)
-        return found, squared.sqrt()
-    tree, ranks = build_tree(sites), [*range(1, count + 1)]
+        return nearest_in_tiles(points, sites, count)
+    ranks, parts = [*range(1, count + 1)], row_chunks(len(points), CHUNK, HOST)
     rows = np.empty((len(points), count), dtype=np.int64)
-    distances = np.empty((len(points), count), dtype=np.float64)
+    squared = np.empty((len(points), count), dtype=np.float64)
+    try:
+        tree = build_tree(sites)
 
-    def search(part: slice) -> None:
-        distances[part], rows[part] = tree.query(np.asarray(points[part]), k=ranks)
+        def search(part: slice) -> None:
+            distances, rows[part] = tree.query(points[part].double().numpy(), k=ranks)
+            np.square(distances, out=squared[part])
 
-    _in_threads(search, len(points))
-    rows = np.minimum(rows, len(sites) - 1)  # one too many where squares of distances overflow
-    return torch.from_numpy(rows), torch.from_numpy(distances)
+        if len(parts) == 1:
+            search(parts[0])
+        else:
+            with ThreadPoolExecutor(thread_count()) as pool:
+                list(pool.map(search, parts))
+    except ValueError as error:
+        raise InvalidArgumentError(
+            "points and sites must be finite, found NaN or infinite coordinates."
+        ) from error
+    np.minimum(rows, len(sites) - 1, out=rows)  # one too many where squares of distances overflow
+    return torch.from_numpy(rows), torch.from_numpy(squared)
 
 
 def runs_of_equal(sites: Float[Tensor, "m d"]) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]] | None:
