@@ -141,20 +141,25 @@ def plan_effects(
     for name, values in given.items():
         if values.shape != scene.logit_opacities.shape:
             raise InvalidArgumentError(f"{name} must be one number for each Gaussian of the scene.")
+    opacities = scene.opacities
     shares = [
-        far_share(distances, masses * drawn_rows(scene.opacities)),
-        haze_share(scene.opacities, apparent, config),
+        far_share(distances, masses * drawn_rows(opacities)),
+        haze_share(opacities, apparent, config),
         duplicate_share(scene.means, scene.sh0),
         mean_clamped(scene, masses),
     ]
     figures = torch.stack(shares).tolist()  # one synchronization with the device
     far, hazy, duplicates, clamped = figures
     above = (far - UNBOUNDED_SHARE) / (FULLY_UNBOUNDED_SHARE - UNBOUNDED_SHARE)
-    beyond = f"of the mass is beyond {UNBOUNDED_DISTANCE:g} robust radii"
-    unbounded = _by_share(far, choices.unbounded, UNBOUNDED_SHARE, beyond)
+    unbounded = _decide(
+        far,
+        choices.unbounded,
+        f"of the mass is beyond {UNBOUNDED_DISTANCE:g} robust radii",
+        least=UNBOUNDED_SHARE,
+    )
     return EffectPlan(
         sh=_plan_bands(scene, choices.sh),
-        mip=_if_present(
+        mip=_decide(
             scene.antialiased, choices.mip, "the comment SplatRenderMode: mip is present (1)"
         ),
         unbounded=GradedEffect(
@@ -162,22 +167,25 @@ def plan_effects(
             strength=min(1.0, max(0.0, above)) if unbounded.active else 0.0,
         ),
         haze=plan_haze(hazy, config),
-        flat=_if_present(
+        flat=_decide(
             scene.has_two_scales, choices.flat, "the file has two scales per Gaussian (1)"
         ),
-        duplicates=_by_share(
+        duplicates=_decide(
             duplicates,
             choices.duplicates,
-            DUPLICATE_SHARE,
             "of the Gaussians coincide with others of the same colour",
+            least=DUPLICATE_SHARE,
         ),
-        clamping=_by_share(
-            clamped, choices.clamping, CLAMPED, "of full brightness, on average, is below zero"
+        clamping=_decide(
+            clamped,
+            choices.clamping,
+            "of full brightness, on average, is below zero",
+            least=CLAMPED,
         ),
-        extras=_if_present(
+        extras=_decide(
             len(scene.extras), choices.extras, "there are columns beyond the standard ones"
         ),
-        visibility=_if_present(
+        visibility=_decide(
             config.visibility.views, choices.visibility, "the preset asks for images"
         ),
     )
@@ -227,22 +235,12 @@ def _plan_bands(scene: GaussianScene, choice: str | int) -> BandsEffect:
     )
 
 
-def _by_share(share: float, choice: str, least: float, what: str) -> Effect:
-    """Decide on an effect: on above the share ``least``, or above 0 if it is forced on."""
+def _decide(figure: float, choice: str, what: str, *, least: float = 0.0) -> Effect:
+    """Decide on an effect: on above ``least``, or above 0 if it is forced on."""
     return Effect(
-        active=share > (least if choice == "auto" else 0.0) and choice != "off",
-        figure=share,
-        meaning=f"on if more than {least:g} {what}",
-        forced=choice != "auto",
-    )
-
-
-def _if_present(figure: float, choice: str, what: str) -> Effect:
-    """Decide on an effect: on where there is something to compute, unless it is switched off."""
-    return Effect(
-        active=figure > 0 and choice != "off",
+        active=figure > (least if choice == "auto" else 0.0) and choice != "off",
         figure=figure,
-        meaning=f"on if {what}",
+        meaning=f"on if more than {least:g} {what}" if least else f"on if {what}",
         forced=choice != "auto",
     )
 
