@@ -72,7 +72,7 @@ def test_coincident_sites_are_not_compared_with_all_points(monkeypatch):
 
     def counted(*arguments):
         found = search(*arguments)
-        listed.append(len(found.leaves))
+        listed.append(len(found[0]))
         return found
 
     monkeypatch.setattr(device_search, "_candidates", counted)

@@ -143,14 +143,6 @@ class Tiles(NamedTuple):
     reach: Float[Tensor, "t"]  # distance from the middle within which all nearest sites lie
 
 
-class Candidates(NamedTuple):
-    """Lists of leaves that may hold a nearest site, one after the other."""
-
-    leaves: Int[Tensor, "p"]  # the leaves of all lists
-    starts: Int[Tensor, "t"]  # where the list of each tile starts
-    numbers: Int[Tensor, "t"]  # its length, at least 1
-
-
 def nearest_in_tiles(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int = 1
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
@@ -242,8 +234,10 @@ def tiles_of(
     )
 
 
-def _candidates(tiles: Tiles, levels: Sequence[Boxes]) -> Candidates:
-    """Return the leaves that may hold a nearest site of each tile.
+def _candidates(
+    tiles: Tiles, levels: Sequence[Boxes]
+) -> tuple[Int[Tensor, "p"], Int[Tensor, "t"], Int[Tensor, "t"]]:
+    """Return lists of leaves that may hold a nearest site, and start and length of each tile's.
 
     Boxes are compared in float32, which halves the memory to read, and so that no pair is lost.
     """
@@ -273,26 +267,27 @@ def _candidates(tiles: Tiles, levels: Sequence[Boxes]) -> Candidates:
         parent, child = is_near.nonzero().unbind(1)
         tile, box = tile[parent], box[parent, child]
     edges = torch.searchsorted(tile, torch.arange(len(ours) + 1, device=device))
-    return Candidates(box, edges[:-1], edges.diff())
+    return box, edges[:-1], edges.diff()
 
 
 def _nearest_of_tiles(
     tiles: Tiles, leaves: Leaves, boxes: Sequence[Boxes], count: int, *, is_exact: bool
 ) -> Int[Tensor, "n k"]:
     """Return places in the leaves of the nearest sites of all points of the tiles, leaf by leaf."""
-    candidates = _candidates(tiles, boxes)
+    near, starts, numbers = _candidates(tiles, boxes)
     (_, side, _), (_, size) = tiles.points.shape, leaves.rows.shape
     device = tiles.points.device
     longest = chunk_length(DISTANCES, device) // (side * size * (EXACT_COST if is_exact else 1))
-    negative, order = torch.sort(-candidates.numbers, stable=True)
+    negative, order = torch.sort(-numbers, stable=True)
     groups = _alike(negative.tolist(), longest)
     ranks = torch.arange(groups[0][1], device=device)
-    lists = torch.nn.functional.pad(candidates.leaves, (0, len(ranks)))  # for ranks beyond the end
-    starts, numbers = candidates.starts[order, None], candidates.numbers[order, None]
+    lists = torch.nn.functional.pad(near, (0, len(ranks)))  # for ranks beyond the end
+    starts, numbers = starts[order, None], numbers[order, None]
     points, reach = tiles.points[order], tiles.reach[order, None, None]
     if not is_exact:
         middles = 0.5 * points.amin(1, keepdim=True) + 0.5 * points.amax(1, keepdim=True)
-        points = _factors(points.sub_(middles).div_(reach))
+        points = points.sub_(middles).div_(reach).float().mul_(-2.0)
+        points = torch.nn.functional.pad(points, (0, 1), value=1.0)
     places = torch.empty(*points.shape[:2], count, dtype=torch.int64, device=device)
     for group, most in groups:
         choice = lists[starts[group] + ranks[:most]]
@@ -330,11 +325,6 @@ def _alike(negative: Sequence[int], longest: int) -> list[tuple[slice, int]]:
     return groups
 
 
-def _factors(points: Float[Tensor, "g q d"]) -> Float[Tensor, "g q d_plus_1"]:
-    """Return the factors of points in the products of :func:`_fast_distances`."""
-    return torch.nn.functional.pad(points.float().mul_(-2.0), (0, 1), value=1.0)
-
-
 def _fast_distances(
     factors: Float[Tensor, "g q d_plus_1"],
     sites: Float[Tensor, "g c d"],
@@ -342,8 +332,9 @@ def _fast_distances(
 ) -> Float[Tensor, "g q c"]:
     """Return squared distances less those of the points to the middle, in float32.
 
-    Points and sites are relative to the middle, in units of the reach; distances are infinite where
-    there is no site. Sites beyond the reach come closer, but not within it.
+    Points and sites are relative to the middle, in units of the reach; the factors are -2 times the
+    points, and 1. Distances are infinite where there is no site. Sites beyond the reach come
+    closer, but not within it.
     """
     sites = sites.clamp_(-4.0, 4.0).float()
     norms = sites.square().sum(2).masked_fill_(none, torch.inf)
