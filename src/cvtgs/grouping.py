@@ -109,14 +109,6 @@ def weigh_rows(
     )
 
 
-def with_importance(points: WeightedRows, importance: Float[Tensor, "n"] | None) -> WeightedRows:
-    """Multiply apparent masses, which scale the costs of merging, by factors of all Gaussians."""
-    if importance is None:
-        return points
-    masses = points.apparent_masses * importance.index_select(0, points.rows)
-    return points._replace(apparent_masses=masses, moments=None)
-
-
 def importance_by_errors(
     small: GaussianScene,
     partition: cells.Partition,

@@ -25,7 +25,6 @@ from cvtgs.grouping import (
     collect_cells,
     tessellate_rows,
     weigh_rows,
-    with_importance,
 )
 from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import Net, correct_cells
@@ -183,7 +182,9 @@ def group_and_merge(  # noqa: PLR0913 (options by name)
         rows, left_out, left_out_mass_share = filter_rows(scene, analysis, target, config.filter)
     with clock.stage("weigh"):
         points = weigh_rows(scene, rows, analysis, config, ordered=ordered)
-        points = with_importance(points, importance)
+        if importance is not None:
+            masses = points.apparent_masses * importance.index_select(0, points.rows)
+            points = points._replace(apparent_masses=masses, moments=None)
     del rows  # frees memory
     with clock.stage("tessellate", config.cvt.iterations + 1) as advance:
         tessellation = tessellate_rows(points, analysis, target, config, on_iteration=advance)
