@@ -107,8 +107,6 @@ def correct_cells(  # noqa: PLR0913 (options by name)
     # Near the limits of the dtype (a flyaway at 3e38) a correction may overflow.
     flat = [values.reshape(len(values), -1) for values in tensors.values()]
     finite = torch.stack([values.isfinite().all(dim=1) for values in flat]).all(dim=0)
-    if scene.device.type == "cpu" and bool(finite.all()):  # elsewhere, the host would wait
-        return merged.with_tensors(tensors)
     tensors = {
         name: torch.where(finite.view(-1, *[1] * (values.dim() - 1)), values, originals[name])
         for name, values in tensors.items()
