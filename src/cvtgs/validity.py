@@ -116,6 +116,7 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
         {}
     """
     masks: dict[str, Tensor] = {}
+    longest = chunk_length(1 << 16, scene.device)
     for name, values in scene.tensors().items():
         if name == "logit_opacities":
             masks[name] = values.isnan()
@@ -123,8 +124,7 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
         # Avoids a boolean array with an entry per value: a finite number times 0 is 0, any other
         # is NaN, and a sum with a NaN is NaN.
         flat = values.flatten(start_dim=1)
-        length = chunk_length(1 << 16, scene.device) // max(1, flat.shape[1])
-        parts = flat.split(max(1 << 16, length))
+        parts = flat.split(max(1 << 16, longest // max(1, flat.shape[1])))
         masks[name] = torch.cat([(part * 0).sum(dim=1) != 0 for part in parts])
     masks["quats"] |= (scene.quats == 0).all(dim=1)
     if scene.dtype == torch.float64:

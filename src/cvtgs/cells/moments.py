@@ -9,7 +9,7 @@ from torch import Tensor
 from cvtgs.checks import checked
 from cvtgs.devices import HOST, in_chunks, move_together, one_thread
 from cvtgs.math.frames import RobustFrame
-from cvtgs.math.parameters import normalize_quats, quats_to_matrices
+from cvtgs.math.parameters import rotation_matrices
 from cvtgs.math.segments import label_sums, take_columns
 from cvtgs.math.spherical_harmonics import LARGEST_COLOR, SH_C0
 from cvtgs.scene import GaussianScene
@@ -108,8 +108,8 @@ def gaussian_moments(
         positions = scene.means.index_select(0, some).double() - center
         means[:, part] = (positions / frame.radius).T
         scales = torch.exp(scene.log_scales.index_select(0, some).double()) / frame.radius
-        quats = normalize_quats(scene.quats.index_select(0, some).double())
-        columns = (quats_to_matrices(quats) * scales[:, None, :]).permute(1, 2, 0).contiguous()
+        rotations = rotation_matrices(scene.quats.index_select(0, some).double())
+        columns = (rotations * scales[:, None, :]).permute(1, 2, 0).contiguous()
         for number, (i, j) in enumerate(UPPER):
             covariances[number, part] = (columns[i] * columns[j]).sum(0)
         bands = scene.sh0.index_select(0, some)[:, 0]
