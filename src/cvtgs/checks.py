@@ -81,7 +81,7 @@ def _found(value: object) -> str:
 def check_range(values: Tensor, most: float, name: str) -> None:
     """Raise unless all values are from 0 to a number; those on other devices than CPUs pass."""
     if values.device.type == "cpu" and len(values):
-        low, high = (end.item() for end in values.aminmax())
+        low, high = map(Tensor.item, values.aminmax())
         if not (low >= 0 and high <= most):
             raise InvalidArgumentError(
                 f"{name} must be between 0 and {most}, found {low} to {high}."
@@ -135,7 +135,7 @@ def row_numbers(rows: Rows, count: int, *, things: str, device: torch.device) ->
     if picked.dtype not in (torch.int32, torch.int64):
         picked = picked.to(torch.int64)
     if device.type == "cpu" and len(picked):
-        low, high = (int(end) for end in picked.aminmax())
+        low, high = map(int, picked.aminmax())
         if low < -count or high >= count:
             raise InvalidArgumentError(
                 f"row numbers of {count:,} {things} must be from {-count} to {count - 1}, "

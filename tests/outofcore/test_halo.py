@@ -238,7 +238,7 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
     for block, part in zip(job.blocks_with_rows(), scenes, strict=True):
         rows = torch.arange(start, start + len(part))
         must_stay = blocks[heaviest] == block
-        some, own = Moments(*take_columns(rows, *members)), merged[labels][rows]
+        some, own = Moments(*(take_columns(rows, one) for one in members)), merged[labels][rows]
         final.append(cells.reassign(some, own, wanted, near, config, must_stay=must_stay))
         start += len(part)
     found = [read_cells(job, block) for block in job.blocks_with_cells()]

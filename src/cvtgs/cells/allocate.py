@@ -334,16 +334,15 @@ def reassign(
     inverse, volumes = _inverse(groups.covariances)
     found = labels.new_empty(len(labels) + 1)  # the last is for groups without members
     own_costs = torch.empty(len(labels), dtype=torch.float64, device=labels.device)
-    tables = torch.cat([groups.means, groups.colors, volumes[None]]), inverse
+    table = torch.cat([groups.means, groups.colors, volumes[None], inverse])
 
     def search(part: slice) -> None:
         cells = labels[part]
         mean, covariance = members.means[:, part], members.covariances[:, part]
         color = members.colors[:, part]
         least, best = None, cells
-        for group in take_columns(cells, candidates)[0]:
-            values, matrix = take_columns(group, *tables)
-            center, tint, (cost,) = values.split([3, 3, 1])
+        for group in take_columns(cells, candidates):
+            center, tint, (cost,), matrix = take_columns(group, table).split([3, 3, 1, 6])
             shifts = mean - center
             cost = cost + 2 * config.color * (color - tint).square().sum(0)
             for k, (r, c) in enumerate(UPPER):

@@ -168,7 +168,7 @@ def side_cover(
     means, rotations, scales = _frames(scene, rows)
     other_means, other_rotations, other_scales = _frames(scene, others)
     arms = (rotations * (PROBE_SIGMAS * scales)[:, None, :]).permute(1, 2, 0).flatten(0, 1)
-    (table,) = take_columns(ids, torch.cat([means.T, arms]))
+    table = take_columns(ids, torch.cat([means.T, arms]))
     shifts = project_on_axes(other_rotations, (table[:3].T - other_means)[:, :, None])
     arms = project_on_axes(other_rotations, table[3:].unflatten(0, (3, 3)).permute(2, 0, 1))
     logits = scene.logit_opacities.index_select(0, others).double()

@@ -185,10 +185,10 @@ def mean_and_covariance(
     """
     offsets, cells = members.offsets, members.cells
     first = members.means.index_select(0, offsets[:-1]).T.contiguous()
-    local = members.means.T - take_columns(cells, first)[0]
+    local = members.means.T - take_columns(cells, first)
     shift = segment_sum(local.T, offsets, weights).T.contiguous()
     axes = parameters.quats_to_matrices(members.quats) * members.scales[:, None, :]
-    local = local - take_columns(cells, shift)[0]
+    local = local - take_columns(cells, shift)
     x, y, z = local
     # Sums of products of columns; batched products of small matrices take ten times as long.
     products = torch.cat([x * local, y * local[1:], z * local[2:]])

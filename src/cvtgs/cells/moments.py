@@ -166,7 +166,7 @@ def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Mom
     columns = [*members.means, *members.colors, *members.view_colors]
     sums = label_sums(columns, labels, count, shares)
     means, colors, varying = sums[:3], sums[3:6], sums[6:]
-    shifts = take_columns(labels, means)[0]
+    shifts = take_columns(labels, means)
     torch.sub(members.means, shifts, out=shifts)
     products = torch.empty_like(members.covariances)
     for product, (i, j) in zip(products, UPPER, strict=True):

@@ -56,11 +56,9 @@ def gather_columns(
     return [table.T.gather(1, rows.expand(table.shape[1], -1)).T for table in tables]
 
 
-def take_columns(
-    rows: Int[Tensor, "r"], *tables: Shaped[Tensor, "*c n"]
-) -> list[Shaped[Tensor, "*c r"]]:
+def take_columns(rows: Int[Tensor, "r"], table: Shaped[Tensor, "*c n"]) -> Shaped[Tensor, "*c r"]:
     """Return entries along the last dimension, in float64 four times as fast as index_select."""
-    return [table.gather(-1, rows.expand(*table.shape[:-1], -1)) for table in tables]
+    return table.gather(-1, rows.expand(*table.shape[:-1], -1))
 
 
 def running_sums(values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:

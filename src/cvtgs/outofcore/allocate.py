@@ -150,7 +150,7 @@ def _add_parts(job: Job, region: Sequence[int], cell_counts: Sequence[int]) -> M
         tensors = job.read("parts", block)
         owners, numbers = _cells_of_parts(block, tensors)
         rows = (starts[owners] >= 0).nonzero()[:, 0]
-        found.append(Moments(*take_columns(rows, *(tensors[name] for name in Moments._fields))))
+        found.append(Moments(*(take_columns(rows, tensors[name]) for name in Moments._fields)))
         labels.append(starts[owners[rows]] + numbers[rows])
     joined = Moments(*(torch.cat(columns, dim=-1) for columns in zip(*found, strict=True)))
     return cells.group_moments(joined, torch.cat(labels), total)
@@ -219,5 +219,5 @@ def _take(job: Job, keys: Int[Tensor, "k"], *names: str) -> list[Tensor]:
     for block, rows in zip(blocks.tolist(), numbers, strict=True):
         tensors = job.read("groups", block)
         for name, values in zip(names, parts, strict=True):
-            values.append(take_columns(rows, tensors[name])[0])
-    return take_columns(inverse, *[torch.cat(values, dim=-1) for values in parts])
+            values.append(take_columns(rows, tensors[name]))
+    return [take_columns(inverse, torch.cat(values, dim=-1)) for values in parts]
