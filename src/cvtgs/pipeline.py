@@ -300,21 +300,18 @@ def level_facts(
     ``is_valid`` says which input rows the scene has; None if it has all of them.
     """
     partition = reduced.partition
+    if partition is None and is_valid is None:
+        return 0.0, None
     if partition is None:
-        kept = torch.arange(len(scene), dtype=torch.int32, device=scene.device)
-        return 0.0, None if is_valid is None else _of_input(kept, is_valid)
-    masses = analysis.apparent_areas * analysis.opacities
-    error = geometric_error(scene, reduced.scene, partition, masses=masses)
-    return error, _of_input(partition.labels(len(scene)), is_valid)
-
-
-def _of_input(labels: Int[Tensor, "v"], is_valid: Bool[Tensor, "n"] | None) -> Int[Tensor, "n"]:
-    """Return labels of valid rows as labels of all input rows, on the CPU."""
-    if is_valid is None:
-        return labels.cpu()
-    found = labels.new_full((len(is_valid),), -1)
-    found[is_valid] = labels
-    return found.cpu()
+        error, labels = 0.0, torch.arange(len(scene), dtype=torch.int32, device=scene.device)
+    else:
+        masses = analysis.apparent_areas * analysis.opacities
+        error = geometric_error(scene, reduced.scene, partition, masses=masses)
+        labels = partition.labels(len(scene))
+    if is_valid is not None:
+        of_valid, labels = labels, labels.new_full((len(is_valid),), -1)
+        labels[is_valid] = of_valid
+    return error, labels.cpu()
 
 
 def geometric_error(
