@@ -90,9 +90,26 @@ def rest_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "
     if degree > 0:
         columns += [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
     if degree > 1:
-        columns += _quadratic(x, y, z)
+        wide, round_ = SH_C2
+        columns += [
+            wide * x * y,
+            -wide * y * z,
+            round_ * (2 * z * z - x * x - y * y),
+            -wide * x * z,
+            0.5 * wide * (x * x - y * y),
+        ]
     if degree > 2:
-        columns += _cubic(x, y, z)
+        xx, yy, zz = x * x, y * y, z * z
+        three, two, one, zero = SH_C3
+        columns += [
+            -three * y * (3 * xx - yy),
+            two * x * y * z,
+            -one * y * (4 * zz - xx - yy),
+            zero * z * (2 * zz - 3 * xx - 3 * yy),
+            -one * x * (4 * zz - xx - yy),
+            0.5 * two * z * (xx - yy),
+            -three * x * (xx - 3 * yy),
+        ]
     return torch.stack(columns, dim=1) if columns else directions[:, :0]
 
 
@@ -219,28 +236,3 @@ def _rest_rotation(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor,
     new, old = rest_basis(directions, degree), rest_basis(directions @ rotation, degree)
     matrix: Tensor = torch.linalg.lstsq(new, old).solution
     return torch.where(matrix.abs() < _ROUNDING, 0.0, matrix)
-
-
-def _quadratic(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
-    wide, round_ = SH_C2
-    return [
-        wide * x * y,
-        -wide * y * z,
-        round_ * (2 * z * z - x * x - y * y),
-        -wide * x * z,
-        0.5 * wide * (x * x - y * y),
-    ]
-
-
-def _cubic(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
-    xx, yy, zz = x * x, y * y, z * z
-    three, two, one, zero = SH_C3
-    return [
-        -three * y * (3 * xx - yy),
-        two * x * y * z,
-        -one * y * (4 * zz - xx - yy),
-        zero * z * (2 * zz - 3 * xx - 3 * yy),
-        -one * x * (4 * zz - xx - yy),
-        0.5 * two * z * (xx - yy),
-        -three * x * (xx - 3 * yy),
-    ]
