@@ -109,9 +109,9 @@ class Descriptors:
             The moved or converted descriptors.
         """
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        moves = {
+        moved = {
             name: value.to(target)
             for name, value in values.items()
             if isinstance(target, torch.device) or value.is_floating_point()
         }
-        return type(self)(**(values | moves))
+        return replace(self, **moved)

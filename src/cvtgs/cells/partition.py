@@ -246,14 +246,19 @@ def sample_members(scene: GaussianScene, part: Partition) -> SampledMembers:
     Systematic sampling (Madow 1949): members are taken where the running sum of masses passes
     equal steps. Members are in the order of a space-filling curve, so that the sample spreads over
     the cell. A sum over all members is estimated by sampled values divided by their rates (Horvitz
-    and Thompson 1952). Masses are in float64, so that every dtype gives the same sample.
+    and Thompson 1952). Masses, relative to the largest of the cell, are in float64, so that every
+    dtype gives the same sample.
     """
     counts, offsets, total = part.counts, part.offsets, len(part.order)
     on_host = part.order.device.type == "cpu"
     if total <= MOST_SAMPLED or (on_host and int(counts.amax()) <= MOST_SAMPLED):
         return SampledMembers(part, counts, scene.logit_opacities.new_ones(total))
     ids = segment_ids(offsets, total)
-    masses = _relative_masses(scene, part, ids)
+    (log_scales,) = gather_columns(part.order, scene.log_scales)
+    opacities = parameters.opacity_from_logit(scene.logit_opacities.index_select(0, part.order))
+    areas = parameters.log_mean_projected_area(log_scales.double())
+    logs = areas + parameters.positive_log(opacities.double())
+    masses = torch.exp(logs - segment_max(logs, offsets).index_select(0, ids))
     sums = torch.nn.functional.pad(running_sums(masses), (1, 0))
     starts, ends = (sums.index_select(0, rows) for rows in (offsets[:-1], offsets[1:]))
     table = torch.stack([starts, MOST_SAMPLED / (ends - starts), counts.double()])
@@ -269,14 +274,3 @@ def sample_members(scene: GaussianScene, part: Partition) -> SampledMembers:
         order=part.order.index_select(0, taken), offsets=places.index_select(0, offsets)
     )
     return SampledMembers(sampled, counts, rates.clamp(LEAST_RATE, 1.0).to(scene.dtype))
-
-
-def _relative_masses(
-    scene: GaussianScene, part: Partition, ids: Int[Tensor, "n"]
-) -> Float[Tensor, "n"]:
-    """Return the mass of every member, relative to the largest of its cell."""
-    (log_scales,) = gather_columns(part.order, scene.log_scales)
-    opacities = parameters.opacity_from_logit(scene.logit_opacities.index_select(0, part.order))
-    areas = parameters.log_mean_projected_area(log_scales.double())
-    logs = areas + parameters.positive_log(opacities.double())
-    return torch.exp(logs - segment_max(logs, part.offsets).index_select(0, ids))
