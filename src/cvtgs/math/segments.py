@@ -1,7 +1,7 @@
 """Segments, which are consecutive runs of rows (CSR): gathering and deterministic reductions."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -77,15 +77,12 @@ def running_sums(values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
 
 
 def label_sums(
-    columns: Iterable[Float[Tensor, "n"]],
+    columns: Sequence[Float[Tensor, "n"]] | Float[Tensor, "k n"],
     labels: Int[Tensor, "n"],
     count: int,
     weights: Float[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "k m"]:
-    """Sum the rows of each label in their order, in float64: the same bits on every device.
-
-    Each column is summed before the next is requested, so they may share memory.
-    """
+    """Sum the rows of each label in their order, in float64: the same bits on every device."""
     on_host = labels.device.type == "cpu"  # adds in order; CUDA would add in any order
     order, offsets = (labels, labels) if on_host else sort_by_label(labels, count)
     buffer = None if weights is None else torch.empty_like(weights)  # new memory is slow to write
