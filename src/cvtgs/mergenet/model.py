@@ -356,16 +356,14 @@ class KnownRange(nn.Module):
         Args:
             cases: Summaries of the cells of every case, at least one case.
         """
-        ends = [_ends(summaries) for summaries in cases]
-        low = torch.stack([end[0] for end in ends]).amin(dim=0)
-        high = torch.stack([end[1] for end in ends]).amax(dim=0)
+        lows, highs = list[Tensor](), list[Tensor]()
+        for summaries in cases:
+            ascending = summaries.sort(dim=0).values
+            cut = int(TAIL * len(ascending))
+            lows.append(ascending[cut])
+            highs.append(ascending[-1 - cut])
+        low, high = torch.stack(lows).amin(dim=0), torch.stack(highs).amax(dim=0)
         high[MEMBERS] = high[MEMBERS].clamp(max=0.2 * math.log(MOST_MEMBERS))
         self.low.copy_(low)
         self.high.copy_(high)
         self.margin.copy_((MARGIN * (high - low)).clamp_min(NARROWEST))
-
-
-def _ends(summaries: Float[Tensor, "m f"]) -> tuple[Float[Tensor, "f"], Float[Tensor, "f"]]:
-    ascending = summaries.sort(dim=0).values
-    cut = int(TAIL * len(ascending))
-    return ascending[cut], ascending[-1 - cut]
