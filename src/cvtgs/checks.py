@@ -28,13 +28,12 @@ def checked(function: Callable[P, Result]) -> Callable[P, Result]:
     A letter of a shape stands for one length in all arguments. Numbers and texts are left to the
     function. Nothing waits for a device.
     """
-    names = [*signature(function).parameters]
     given = {name: item.annotation for name, item in signature(function).parameters.items()}
     kinds = {name: kind for name, kind in given.items() if _is_class(kind)}
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> Result:
-        check_kinds(kinds, dict(zip(names, args, strict=False)) | kwargs)
+        check_kinds(kinds, dict(zip(given, args, strict=False)) | kwargs)
         return function(*args, **kwargs)
 
     return call
