@@ -38,9 +38,6 @@ COUNT, RHO, SIDE = 20_000, 0.1, 256
 class ShowVersions(argparse.Action):
     """Print the versions and exit, without loading any of the packages."""
 
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(nargs=0, **settings)
-
     def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> NoReturn:
         """Print the versions and exit."""
         say("\n".join(version_lines()))

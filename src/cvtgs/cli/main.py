@@ -244,6 +244,7 @@ def build_parser() -> CommandParser:
     parser.add_argument(
         "--version",
         action=ShowVersions,
+        nargs=0,
         help="print the versions of cvtgs, Python and the packages used for computation",
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
