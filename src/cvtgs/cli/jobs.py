@@ -13,12 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import cvtgs
-from cvtgs.cli.display import (
-    WIDTH,
-    say,
-    say_wrapped,
-    send_file,
-)
+from cvtgs.cli.display import WIDTH, say, say_wrapped, send_file
 from cvtgs.cli.options import READABLE, WRITABLE, CommandParser, dotted
 from cvtgs.cli.paths import folder_or_file, is_same_file, names_file
 from cvtgs.errors import (

@@ -35,13 +35,7 @@ from cvtgs.cli.options import (
 )
 from cvtgs.cli.paths import any_path, check_written_files, new_file
 from cvtgs.cli.reports import report_file
-from cvtgs.errors import (
-    ConfigError,
-    FileFormatError,
-    InputError,
-    InvalidArgumentError,
-    warn,
-)
+from cvtgs.errors import ConfigError, FileFormatError, InputError, InvalidArgumentError, warn
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.text import counted
 

@@ -27,12 +27,7 @@ from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
 from cvtgs.outofcore import Workers
 from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.memory import (
-    check_memory,
-    chosen_blocks,
-    memory_to_plan,
-    sample_rows,
-)
+from cvtgs.outofcore.memory import check_memory, chosen_blocks, memory_to_plan, sample_rows
 from cvtgs.outofcore.resume import job_folder, started, with_earlier_sizes
 from cvtgs.outofcore.rows import analysis_of, read_rows
 from cvtgs.outofcore.run import check_config, rows_per_range
