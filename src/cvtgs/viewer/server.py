@@ -10,8 +10,6 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-
 from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.counts import target_count
 from cvtgs.errors import CvtgsError, OutputError, OutputExistsError, memory_errors
@@ -154,15 +152,10 @@ def look_at(server: "viser.ViserServer", scene: GaussianScene) -> Point:
     depth = float(rotation[2] @ (robust_frame(scene.means).center.cpu().double() - center))
     depth = max(depth, 1e-3)
     target, half = center + rotation[2] * depth, camera.height / 2 / float(camera.Ks[0, 1, 1])
-    server.initial_camera.position = _three(center)
-    server.initial_camera.look_at = _three(target)
+    server.initial_camera.position = tuple(center.tolist())
+    server.initial_camera.look_at = tuple(target.tolist())
     server.initial_camera.fov = 2 * math.atan(half)
-    return _three(target - rotation[1] * (_ABOVE * half * depth))
-
-
-def _three(point: torch.Tensor) -> Point:
-    x, y, z = point.tolist()
-    return x, y, z
+    return tuple((target - rotation[1] * (_ABOVE * half * depth)).tolist())
 
 
 class ViewerServer:
@@ -275,19 +268,13 @@ class ViewerServer:
         stop_server(self._server)
 
     def _work(self) -> None:
-        """Work until the server is closed."""
+        """Simplify for the latest position of the slider, until the server is closed."""
         try:
-            self._work_until_closed()
-        finally:
-            self._first.set()
-            self._ended.set()
-
-    def _work_until_closed(self) -> None:
-        """Simplify for the latest position of the slider; skip positions in between."""
-        while not self._closed:
-            self._wanted.wait()
-            self._wanted.clear()
-            if not self._closed:
+            while not self._closed:
+                self._wanted.wait()
+                self._wanted.clear()
+                if self._closed:
+                    break
                 self._error = self._try(self._simplify)
                 is_first = not self._first.is_set()
                 self._first.set()
@@ -295,6 +282,9 @@ class ViewerServer:
                     # The next run reports errors.
                     with suppress(Exception):
                         self._viewer.warm_up(self._preset.value)
+        finally:
+            self._first.set()
+            self._ended.set()
 
     def _move(self) -> None:
         """Take the ratio from the slider."""
