@@ -190,11 +190,10 @@ def near_rows(
     coarsest: GaussianScene, frame: RobustFrame, radii: float | None
 ) -> Bool[Tensor, "c"]:
     """Return a mask of the Gaussians in chunks, at least one; the others are the environment."""
-    near = torch.ones(len(coarsest), dtype=torch.bool)
-    if radii is not None:
-        distances = frame.distances(coarsest.means).cpu()
-        near = distances <= max(radii, float(distances.min()))
-    return near
+    if radii is None:
+        return torch.ones(len(coarsest), dtype=torch.bool)
+    distances = frame.distances(coarsest.means).cpu()
+    return distances <= max(radii, float(distances.min()))
 
 
 def plan_part(
@@ -203,14 +202,15 @@ def plan_part(
     """Build the chunks of a part of a scene; levels are finest first and may have equal sizes."""
     coarsest = ordered[-1]
     means = coarsest.scene.means.double().cpu()
-    weights = torch.ones(len(means), dtype=torch.int64)
-    if len(ordered) > 1:
-        weights = torch.bincount(_parents(ordered[0], coarsest), minlength=len(means)).clamp_min(1)
+    parents = [_parents(level, coarsest) for level in ordered]
+    weights = torch.bincount(parents[0], minlength=len(means)).clamp_min(1)
+    tree, parts = _cut(means, weights, near.nonzero()[:, 0], most=chunk_gaussians)
     labels = torch.full((len(means),), -1)
-    tree, count = _cut(means, weights, labels, near.nonzero()[:, 0], most=chunk_gaussians)
-    of_levels = [labels[_parents(level, coarsest)] for level in ordered]
+    for number, rows in enumerate(parts):
+        labels[rows] = number
+    of_levels = [labels[rows] for rows in parents]
     members = [
-        _rows(own, level.scene, count) for level, own in zip(ordered, of_levels, strict=True)
+        _rows(own, level.scene, len(parts)) for level, own in zip(ordered, of_levels, strict=True)
     ]
     chunks = tuple(_chunk(ordered, rows) for rows in zip(*members, strict=True))
     far = () if bool(near.all()) else tuple((own < 0).nonzero()[:, 0] for own in of_levels)
@@ -249,29 +249,22 @@ def _assignment(level: StreamedLevel) -> Int[Tensor, "n"]:
 
 
 def _cut(
-    means: Float[Tensor, "c 3"],
-    weights: Int[Tensor, "c"],
-    labels: Int[Tensor, "c"],
-    near: Int[Tensor, "k"],
-    *,
-    most: int,
-) -> tuple[_Cut, int]:
+    means: Float[Tensor, "c 3"], weights: Int[Tensor, "c"], near: Int[Tensor, "k"], *, most: int
+) -> tuple[_Cut, list[Int[Tensor, "k"]]]:
     """Split the near Gaussians of the coarsest level until no part replaces more than ``most``."""
-    count = 0
+    parts = []
 
     def part(rows: Int[Tensor, "k"]) -> _Cut:
-        nonlocal count
         if int(weights[rows].sum()) <= most or len(rows) == 1:
-            labels[rows] = count
-            count += 1
-            return count - 1
+            parts.append(rows)
+            return len(parts) - 1
         order = rows[torch.sort(_widest(means[rows]), stable=True).indices]
         passed = weights[order].cumsum(0)
         half = int(torch.searchsorted(passed, int(passed[-1]) // 2))
         half = min(max(half, 1), len(rows) - 1)
         return part(order[:half]), part(order[half:])
 
-    return part(near), count
+    return part(near), parts
 
 
 def _widest(points: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
