@@ -195,7 +195,7 @@ def write_levels(
         source_count=levels[0].report.input_count,
         levels=tuple(sorted(entries, key=lambda entry: -entry.count)),
     )
-    _write_index(index, place, overwrite=overwrite)
+    write_atomically(place / INDEX_NAME, index.to_json().encode(), overwrite=overwrite)
     return index
 
 
@@ -221,9 +221,5 @@ def add_scores(index: LevelsIndex, folder: Path, evaluation: Evaluation) -> Leve
     levels = tuple(level.with_scores(scores[level.file]) for level in index.levels)
     size = {"width": evaluation.width, "height": evaluation.height}
     index = index.model_copy(update={"levels": levels, "views": len(evaluation.views), **size})
-    _write_index(index, folder, overwrite=True)
+    write_atomically(folder / INDEX_NAME, index.to_json().encode(), overwrite=True)
     return index
-
-
-def _write_index(index: LevelsIndex, folder: Path, *, overwrite: bool) -> None:
-    write_atomically(folder / INDEX_NAME, index.to_json().encode(), overwrite=overwrite)
