@@ -1,7 +1,7 @@
 """``cvtgs levels``: several sizes of one scene, and an index for viewers."""
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import cvtgs
@@ -126,11 +126,7 @@ def levels(options: argparse.Namespace) -> None:
             overwrite=options.overwrite,
         )
         if views is not None:
-            files = {
-                name: cvtgs.load(options.output / name, axes=axes.target, trust_sizes=True)
-                for name in names
-            }
-            evaluation = _score(options, scene, files, views, listener)
+            evaluation = _score(options, scene, names, views, listener)
             index = cvtgs.levels.add_scores(index, options.output, evaluation)
     if not options.quiet:
         if views is not None:
@@ -187,21 +183,21 @@ def _checked_views(options: argparse.Namespace, scene: "GaussianScene") -> "Came
 def _score(
     options: argparse.Namespace,
     scene: "GaussianScene",
-    levels: "Mapping[str, GaussianScene]",
+    names: Sequence[str],
     views: "Cameras",
     listener: "ProgressListener",
 ) -> "Evaluation":
+    """Score the files of the levels against the full scene."""
     from cvtgs.devices import chosen_device
 
-    device = chosen_device(options.device)
+    device, axes = chosen_device(options.device), read_axes(options.axes).target
     full = cvtgs.validity.valid_part(scene).to(device)
-    return cvtgs.evaluate(
-        full,
-        {name: level.to(device) for name, level in levels.items()},
-        views,
-        settings=evaluation_settings(options),
-        listener=listener,
-    )
+    files = {
+        name: cvtgs.load(options.output / name, axes=axes, trust_sizes=True).to(device)
+        for name in names
+    }
+    settings = evaluation_settings(options)
+    return cvtgs.evaluate(full, files, views, settings=settings, listener=listener)
 
 
 def _print_index(index: "LevelsIndex") -> None:
