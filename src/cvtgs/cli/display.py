@@ -124,12 +124,8 @@ def report_notes(report: "SimplifyReport") -> list[str]:
     if report.device_note:
         notes.append(f"{report.device_note}.")
     if report.blocks > 1:
-        resumed = (
-            f", {report.resumed_blocks} of them from an earlier run"
-            if report.resumed_blocks
-            else ""
-        )
-        notes.append(f"In {report.blocks} blocks{resumed}.")
+        resumed = f", {report.resumed_blocks} of them from an earlier run"
+        notes.append(f"In {report.blocks} blocks{resumed * (report.resumed_blocks > 0)}.")
     if report.shortfall:
         notes.append(shortfall_note(report))
     if report.config.uses_images and report.views == "none":

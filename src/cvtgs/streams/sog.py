@@ -4,6 +4,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -86,9 +87,7 @@ class SogFormat:
     def index(self, parts: Sequence[StreamPart], folder: Path) -> dict[str, Any]:
         """Return the content of ``lod-meta.json``, and write the environment of all parts."""
         counts = [level.gaussians for level in join_levels(parts)]
-        before = [0]
-        for part in parts:
-            before.append(before[-1] + len(part.names))
+        before = list(accumulate((len(part.names) for part in parts), initial=0))
         scenes = [load(folder / name, trust_sizes=True) for name in _far_files(parts)]
         more = {}
         if scenes:

@@ -351,5 +351,4 @@ def _matrix(numbers: Sequence[float]) -> Float[Tensor, "4 4"]:
 def _median(positions: Float[Tensor, "n 3"]) -> Corner:
     """Return the median of finite positions along each axis; a mean could be far from all."""
     finite = positions[positions.isfinite().all(dim=1)]
-    x, y, z = finite.median(dim=0).values.tolist() if len(finite) else (0.0, 0.0, 0.0)
-    return x, y, z
+    return tuple(finite.median(dim=0).values.tolist()) if len(finite) else (0.0, 0.0, 0.0)
