@@ -54,16 +54,15 @@ class SogFormat:
     ) -> StreamPart:
         """Write the chunks of a level consecutively, so that nearby chunks share a file."""
         units = list(_units(plan, part, self.file_gaussians))
-        sizes, dropped = [0] * len(plan.levels), Counter[str]()
+        files, sizes = ([0] * len(plan.levels) for _ in range(2))
+        dropped = Counter[str]()
         for number, unit in enumerate(units):
             scene = plan.levels[unit.level].scene
             part_of = scene.select(unit.rows.to(scene.device))
+            files[unit.level] += 1
             sizes[unit.level] += _write_sog(part_of, folder / unit.name)
             dropped.update(dropped_within(part_of, FORMAT_LIMITS[".sog"]))
             listener(ProgressEvent(stage="write", done=number + 1, total=len(units)))
-        files = Counter(unit.level for unit in units)
-        counts = enumerate(plan.counts)
-        levels = tuple(StreamLevel(count, files[level], sizes[level]) for level, count in counts)
         far = tuple(map(len, plan.far))
         environments = {
             level: f".environment_{part}_{level}.ply"
@@ -73,7 +72,7 @@ class SogFormat:
         for level, name in environments.items():
             save(plan.far_scene(level), folder / name, overwrite=True)
         return StreamPart(
-            levels=levels,
+            levels=tuple(map(StreamLevel, plan.counts, files, sizes)),
             chunks=len(plan.chunks),
             names=tuple(f"{unit.name}/meta.json" for unit in units),
             tree=_tree(plan, units),

@@ -93,7 +93,7 @@ class TilesFormat:
             sizes[tile.level] += path.stat().st_size
             listener(ProgressEvent(stage="write", done=number + 1, total=len(tiles)))
         return StreamPart(
-            levels=tuple(StreamLevel(*three) for three in zip(counts, files, sizes, strict=True)),
+            levels=tuple(map(StreamLevel, counts, files, sizes)),
             chunks=len(plan.chunks),
             names=tuple(names.values()),
             tree=_entry(plan, root, names, origins),
