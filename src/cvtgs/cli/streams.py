@@ -2,7 +2,8 @@
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import zip_longest
 from typing import TYPE_CHECKING
 
@@ -212,18 +213,10 @@ def stream_levels(
         chunk_gaussians=options.chunk or CHUNK_GAUSSIANS,
         environment_radii=options.environment,
     )
-    if options.stream == "sog":
-        written = write_sog_stream(
-            plan, options.output, overwrite=options.overwrite, listener=listener
-        )
-    else:
-        written = write_tiles(
-            plan,
-            options.output,
-            transform=read_transform(options),
-            overwrite=options.overwrite,
-            listener=listener,
-        )
+    write: Callable[..., tuple[StreamLevel, ...]] = write_sog_stream
+    if options.stream == "3dtiles":
+        write = partial(write_tiles, transform=read_transform(options))
+    written = write(plan, options.output, overwrite=options.overwrite, listener=listener)
     remove_job_files(options.output, is_stream=True)
     errors = [level.geometric_error for level in plan.levels]
     if made[0].report.shortfall and not options.quiet:
