@@ -118,13 +118,12 @@ def _check_folder(folder: Path) -> None:
 
 
 def _column(path: Path, count: int, stages: "Sequence[StageCost]") -> dict[str, str]:
-    seconds = {f"{cost.stage}, s": f"{cost.seconds:.2f}" for cost in stages}
-    total = {"all stages, s": f"{sum(cost.seconds for cost in stages):.2f}"} if stages else {}
-    return (
-        {"file": path.name, "Gaussians": f"{count:,}", "size": size_text(path.stat().st_size)}
-        | seconds
-        | total
-    )
+    size = size_text(path.stat().st_size)
+    column = {"file": path.name, "Gaussians": f"{count:,}", "size": size}
+    column |= {f"{cost.stage}, s": f"{cost.seconds:.2f}" for cost in stages}
+    if stages:
+        column["all stages, s"] = f"{sum(cost.seconds for cost in stages):.2f}"
+    return column
 
 
 def _print_next_steps(folder: Path) -> None:

@@ -60,9 +60,9 @@ def render(options: argparse.Namespace) -> None:
     from cvtgs.io.atomic import make_folder
 
     check_view_options(options)
-    scene = cvtgs.io.load(options.input, trust_sizes=options.trust_sizes).to(
-        chosen_device(options.device)
-    )
+    background = background_color(options)
+    scene = cvtgs.io.load(options.input, trust_sizes=options.trust_sizes)
+    scene = scene.to(chosen_device(options.device))
     cameras = choose_cameras(options, scene)
     make_folder(options.output)
     paths = [options.output / name for name in file_names(cameras.view_names)]
@@ -72,12 +72,7 @@ def render(options: argparse.Namespace) -> None:
     with progress_bars(quiet=options.quiet) as listener, torch.no_grad():
         for number, (path, camera) in enumerate(zip(paths, cameras.singles(), strict=True)):
             listener(ProgressEvent(stage="render", done=number, total=len(paths)))
-            found = cvtgs.render(
-                scene,
-                camera,
-                backend=options.backend,
-                background=background_color(options),
-            )
+            found = cvtgs.render(scene, camera, backend=options.backend, background=background)
             most_seen = max(most_seen, float(found.alpha.mean()))
             png = encode(as_bytes(found.rgb[0]), "png")
             write_atomically(path, png, overwrite=options.overwrite)

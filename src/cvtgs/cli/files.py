@@ -221,13 +221,10 @@ def checkpoint_rows(checkpoint: "Checkpoint") -> list[tuple[str, str]]:
         ("started from", info.start or ("nothing" if info.config else unknown)),
         ("configuration", info.config or unknown),
     ]
-    return rows + [
-        (
-            "validated on" if scene.is_validation else "trained on",
-            f"{scene.name}, {scene.count:,}, {scene.sha256 or 'generated'}",
-        )
-        for scene in info.scenes
-    ]
+    for scene in info.scenes:
+        label = "validated on" if scene.is_validation else "trained on"
+        rows.append((label, f"{scene.name}, {scene.count:,}, {scene.sha256 or 'generated'}"))
+    return rows
 
 
 def _rows(facts: "SceneInfo") -> list[tuple[str, str]]:
@@ -236,26 +233,19 @@ def _rows(facts: "SceneInfo") -> list[tuple[str, str]]:
     invalid = ", ".join(f"{name} {number:,}" for name, number in facts.invalid_rows.items())
     step = facts.robust_radius / 1000
     center = _vector(facts.robust_center, step=step)
+    opacities = zip(QUANTILES, facts.opacity_quantiles, strict=True)
+    shares = [
+        f"{mass:.1%} in {'the heaviest ' * (share == HEAVIEST[0])}{100 * share:g}%"
+        for share, mass in zip(HEAVIEST, facts.mass_shares, strict=True)
+    ]
     rows = [
         ("Gaussians", f"{facts.count:,}"),
         ("SH degree", f"{facts.sh_degree}"),
         ("bounds", " to ".join(_vector(corner, step=step) for corner in facts.bounds)),
         ("robust radius", f"{facts.robust_radius:.4g} around {center}"),
-        (
-            "opacity at",
-            "   ".join(
-                f"{share:.0%} {value:.3f}"
-                for share, value in zip(QUANTILES, facts.opacity_quantiles, strict=True)
-            ),
-        ),
+        ("opacity at", "   ".join(f"{share:.0%} {value:.3f}" for share, value in opacities)),
         ("mass", f"{facts.mass:.4g} square units"),
-        (
-            "mass shares",
-            ", ".join(
-                f"{mass:.1%} in {'the heaviest ' * (share == HEAVIEST[0])}{100 * share:g}%"
-                for share, mass in zip(HEAVIEST, facts.mass_shares, strict=True)
-            ),
-        ),
+        ("mass shares", ", ".join(shares)),
         (
             "opacity < 0.1",
             f"{facts.faint_share:.1%} of the Gaussians, {facts.faint_mass_share:.1%} of the mass",
@@ -340,18 +330,14 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
     from cvtgs.io.limits import LOST_DIGITS
 
     options = job.options
-    axes = read_axes(options.axes)
-    scenes = [
-        cvtgs.io.load(
-            options.input, axes=axes.source, trust_sizes=options.trust_sizes, lod=options.lod
-        )
-    ]
+    axes, trust = read_axes(options.axes), options.trust_sizes
+    scenes = [cvtgs.io.load(options.input, axes=axes.source, trust_sizes=trust, lod=options.lod)]
     for path in options.merge:
         if str(path) == STREAM:
             raise InvalidArgumentError("--merge takes files; only IN may be - for standard input.")
         alike = _format_of(path) == _format_of(options.input)
         source = axes.source if alike else None  # other formats have axes of their own
-        scenes.append(cvtgs.io.load(path, axes=source, trust_sizes=options.trust_sizes))
+        scenes.append(cvtgs.io.load(path, axes=source, trust_sizes=trust))
     # What is dropped is printed below instead.
     with nullcontext() if options.quiet else without_warnings(DroppedDataWarning):
         scene = cvtgs.concatenate(scenes, fill=True)

@@ -268,20 +268,17 @@ def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
                 f"{before} and {source}."
             )
         targets[options.folder / name] = source
+    jobs = []
     for target, source in targets.items():
         for other in [*sources, *getattr(options, "merge", ())]:
             if other != source and is_same_file(target, other):
                 raise InvalidArgumentError(
                     f"the output of {source} must not replace another input, found {target}."
                 )
+        own = argparse.Namespace(**{**vars(options), "input": source, "output": target})
+        jobs.append(SceneJob(options=own, is_one_of_many=True))
     make_folder(options.folder)
-    return [
-        SceneJob(
-            options=argparse.Namespace(**{**vars(options), "input": source, "output": target}),
-            is_one_of_many=True,
-        )
-        for target, source in targets.items()
-    ]
+    return jobs
 
 
 def expanded(patterns: Iterable[str | Path]) -> list[Path]:
