@@ -45,11 +45,7 @@ multiplied by it, so that viewers refine where Gaussians are off by one pixel.""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Tile:
-    """A tile: consecutive chunks at one level, and the finer tiles that replace it.
-
-    Its positions and its box are relative to its origin, so that they keep their digits far from
-    the origin of the scene.
-    """
+    """A tile: consecutive chunks at one level, and the finer tiles that replace it."""
 
     node: StreamNode
     level: int
