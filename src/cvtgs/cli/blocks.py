@@ -3,7 +3,7 @@
 import argparse
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING
 
 from cvtgs.cli.display import say
@@ -75,21 +75,21 @@ def block_workers(
     from cvtgs.processes import pool_size
 
     try:
-        with ExitStack() as stack:
-            if options.scheduler is not None:
-                client = stack.enter_context(closing(connect(options.scheduler)))
+        if options.scheduler is not None:
+            with closing(connect(options.scheduler)) as client:
                 yield ClusterWorkers(client), memory
-                return
-            count = worker_count(memory, options.workers)
-            if options.workers is not None and count < pool_size(options.workers):
-                warn(
-                    f"--workers {options.workers}: the memory is enough for {count}, at "
-                    f"{size_text(WORKER_BYTES)} each."
-                )
-            if count > 1:
-                yield stack.enter_context(LocalWorkers(count)), memory // count
-            else:
-                yield None, memory
+            return
+        count = worker_count(memory, options.workers)
+        if options.workers is not None and count < pool_size(options.workers):
+            warn(
+                f"--workers {options.workers}: the memory is enough for {count}, at "
+                f"{size_text(WORKER_BYTES)} each."
+            )
+        if count > 1:
+            with LocalWorkers(count) as workers:
+                yield workers, memory // count
+        else:
+            yield None, memory
     except (KeyboardInterrupt, OutputError, RunError, MemoryError) as error:
         if can_continue(options.output):
             if not isinstance(error, OutputBusyError):
