@@ -16,7 +16,6 @@ from cvtgs.cli.jobs import (
     Outcome,
     SceneJob,
     add_paths,
-    check_paths,
     input_file,
     open_jobs,
     run_jobs,
@@ -292,7 +291,6 @@ def add_convert(add_parser: AddParser) -> None:
         "merged, cropped, filtered and moved.",
     )
     parser.set_defaults(run=convert)
-    parser.check = check_paths
     add_paths(parser, options="")
     add_options(parser, "--sh-degree", "--axes", "--lod", "--trust-sizes", "--overwrite", "--quiet")
     parser.add_argument(

@@ -55,7 +55,8 @@ class SceneJob:
 
 
 def add_paths(parser: CommandParser, *, options: str) -> None:
-    """Add IN and OUT, or many IN and -o DIR, to a command."""
+    """Add IN and OUT, or many IN and -o DIR, to a command, and their check."""
+    parser.check = check_paths
     parser.usage = (
         f"{parser.prog} IN OUT {options}[options]\n       {parser.prog} IN [IN ...] -o DIR "
         f"{options}[options]"
@@ -95,18 +96,19 @@ def check_paths(parser: CommandParser, options: argparse.Namespace) -> None:
             scenes = counted(len(options.paths), "scene")
             parser.error(f"-o must be a folder for {scenes}, found {str(options.folder)!r}")
         options.paths, options.folder = [*options.paths, str(options.folder)], None
-    if options.folder is None and len(options.paths) != 2:
+    if options.folder is not None:
+        if STREAM in options.paths:
+            parser.error("- cannot be used with -o DIR; give IN and OUT")
+        return
+    if len(options.paths) != 2:
         found = f"{counted(len(options.paths), 'path')} ({shortened(', '.join(options.paths), 60)})"
         parser.error(
             f"give IN and OUT, or any number of IN and -o DIR to write into a folder; found {found}"
         )
-    if options.folder is None and (
-        os.path.isdir(options.paths[1]) or options.paths[1].endswith(("/", os.sep))  # noqa: PTH112
-    ):
-        parser.error(f"OUT must be a file; to write into a folder, use -o {options.paths[1]}")
-    if options.folder is not None and STREAM in options.paths:
-        parser.error("- cannot be used with -o DIR; give IN and OUT")
-    if options.suffix and options.folder is None and options.paths[1] != STREAM:
+    target = options.paths[1]
+    if os.path.isdir(target) or target.endswith(("/", os.sep)):  # noqa: PTH112 (any path)
+        parser.error(f"OUT must be a file; to write into a folder, use -o {target}")
+    if options.suffix and target != STREAM:
         parser.error("--suffix needs -o DIR or - as OUT; otherwise the name of OUT sets the format")
 
 

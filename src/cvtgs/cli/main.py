@@ -134,8 +134,7 @@ def _lock(options: argparse.Namespace) -> AbstractContextManager[None]:
 @contextmanager
 def _without_empty_folder(options: argparse.Namespace) -> Iterator[None]:
     """After an error, remove the output folders that the command made and left empty."""
-    named = (getattr(options, name, None) for name in ("folder", "output"))
-    folder = next((path for path in named if path is not None), Path())
+    folder = getattr(options, "folder", None) or getattr(options, "output", None) or Path()
     new = [
         path
         for path in (folder, *folder.parents)

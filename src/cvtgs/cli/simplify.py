@@ -19,7 +19,7 @@ from cvtgs.cli.goals import (
     search_target,
     with_limited_bands,
 )
-from cvtgs.cli.jobs import Outcome, SceneJob, add_paths, check_paths, open_jobs, run_jobs
+from cvtgs.cli.jobs import Outcome, SceneJob, add_paths, open_jobs, run_jobs
 from cvtgs.cli.options import (
     CAMERA_FILES,
     AddParser,
@@ -54,7 +54,6 @@ def add_simplify(add_parser: AddParser) -> None:
         description="Write a scene with exactly ceil(rho * N) of the N Gaussians of IN.",
     )
     parser.set_defaults(run=simplify)
-    parser.check = check_paths
     add_paths(parser, options="--rho R|--count M|... ")
     size = parser.add_mutually_exclusive_group(required=True)
     size.add_argument(
