@@ -104,12 +104,11 @@ class StreamJob:
         """Return the written part of a block; None unless all its files are complete."""
         try:
             part = StreamPart.model_validate_json(self.part_path(block).read_bytes())
-            sizes = [_bytes_of(self.folder / name, self.form.kind) for name in part.names]
-            if not all((self.folder / name).exists() for name in part.environments.values()):
-                return None
+            size = sum(_bytes_of(self.folder / name, self.form.kind) for name in part.names)
+            has_far = all((self.folder / name).exists() for name in part.environments.values())
         except (OSError, ValueError):
             return None
-        return part if sum(sizes) == sum(level.bytes for level in part.levels) else None
+        return part if has_far and size == sum(level.bytes for level in part.levels) else None
 
     def targets(self) -> list[list[int]]:
         """Return the number of Gaussians of each block at each level, the finest first."""
