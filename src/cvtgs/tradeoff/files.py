@@ -235,16 +235,13 @@ def heading(tradeoff: Tradeoff, rho: float) -> str:
 
 def how_measured(tradeoff: Tradeoff) -> str:
     """Return a text on where and how this was measured."""
-    evaluation = tradeoff.evaluation
-    against = next(
-        (
-            f"The full scene has {full.psnr.mean:.2f} dB and an SSIM of {full.ssim.mean:.4f} "
-            f"against the photographs. "
-            for full in evaluation.photographs
-            if full.name == evaluation.reference
-        ),
-        "",
-    )
+    evaluation, against = tradeoff.evaluation, ""
+    for full in evaluation.photographs:
+        if full.name == evaluation.reference:
+            against = (
+                f"The full scene has {full.psnr.mean:.2f} dB and an SSIM of {full.ssim.mean:.4f} "
+                f"against the photographs. "
+            )
     return (
         f"{counted(len(evaluation.views), 'view')} "
         f"of {evaluation.width} x {evaluation.height} pixels, rendered by {evaluation.backend}. "
