@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from functools import partial
 from pathlib import PurePosixPath, PureWindowsPath
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.cameras import (
@@ -101,17 +101,10 @@ def file_names(views: Sequence[str]) -> list[str]:
     return [f"{number:03d}_{stem}.png" for number, stem in enumerate(stems, start=1)]
 
 
-class _Scenes(NamedTuple):
-    """The full scene and the other scenes, and the file sizes of all, by name."""
-
-    name: str
-    reference: "GaussianScene"
-    others: "dict[str, GaussianScene]"
-    sizes: dict[str, int]
-
-
-def _read_scenes(options: argparse.Namespace) -> _Scenes:
-    """Read REF and every SMALL; name them after their files."""
+def _read_scenes(
+    options: argparse.Namespace,
+) -> "tuple[dict[str, GaussianScene], dict[str, int]]":
+    """Read REF and every SMALL, in this order; return scenes and file sizes by name."""
     from cvtgs.devices import chosen_device
 
     paths = [options.reference, *expanded(options.small)]
@@ -125,14 +118,9 @@ def _read_scenes(options: argparse.Namespace) -> _Scenes:
         raise InvalidArgumentError(f"every scene must be given once, found {twice[0]} twice.")
     device = chosen_device(options.device)
     trust = options.trust_sizes
-    reference, *others = (cvtgs.io.load(path, trust_sizes=trust).to(device) for path in paths)
+    scenes = [cvtgs.io.load(path, trust_sizes=trust).to(device) for path in paths]
     sizes = [cvtgs.io.scene_size(path) for path in paths]
-    return _Scenes(
-        name=names[0],
-        reference=reference,
-        others=dict(zip(names[1:], others, strict=True)),
-        sizes=dict(zip(names, sizes, strict=True)),
-    )
+    return dict(zip(names, scenes, strict=True)), dict(zip(names, sizes, strict=True))
 
 
 def add_evaluate(add_parser: AddParser) -> None:
@@ -154,15 +142,16 @@ def evaluate(options: argparse.Namespace) -> None:
     """Run ``cvtgs evaluate``."""
     check_view_options(options)
     settings = evaluation_settings(options)
-    scenes = _read_scenes(options)
+    scenes, sizes = _read_scenes(options)
+    (name, reference), *others = scenes.items()
     with progress_bars(quiet=options.quiet) as listener:
-        cameras = choose_cameras(options, scenes.reference)
+        cameras = choose_cameras(options, reference)
         photographs = None if options.images is None else read_photographs(options, cameras)
         evaluation = cvtgs.evaluate(
-            scenes.reference,
-            scenes.others,
+            reference,
+            dict(others),
             cameras,
-            reference_name=scenes.name,
+            reference_name=name,
             photographs=photographs,
             settings=settings,
             listener=listener,
@@ -170,7 +159,7 @@ def evaluate(options: argparse.Namespace) -> None:
     if options.json:
         say(evaluation.to_json(), end="")
     elif not options.quiet:
-        _print_scores(evaluation, scenes.sizes)
+        _print_scores(evaluation, sizes)
 
 
 def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
@@ -222,14 +211,15 @@ def compare(options: argparse.Namespace) -> None:
     check_view_options(options)
     check_comparison_files(options.output, overwrite=options.overwrite)
     check_page(options)
-    scenes = _read_scenes(options)
+    scenes, sizes = _read_scenes(options)
+    (name, reference), *others = scenes.items()
     with progress_bars(quiet=options.quiet) as listener:
         comparison = cvtgs.evaluation.compare(
-            scenes.reference,
-            scenes.others,
-            choose_cameras(options, scenes.reference),
-            reference_name=scenes.name,
-            sizes=scenes.sizes,
+            reference,
+            dict(others),
+            choose_cameras(options, reference),
+            reference_name=name,
+            sizes=sizes,
             most_images=options.views or MOST_CAMERAS,
             settings=evaluation_settings(options),
             listener=listener,
@@ -242,9 +232,9 @@ def compare(options: argparse.Namespace) -> None:
             listener=listener,
         )
     if not options.quiet:
-        _print_scores(comparison.evaluation, scenes.sizes)
+        _print_scores(comparison.evaluation, sizes)
         say(f"Wrote {', '.join(path.name for path in paths)}. Open {paths[-1]} in a browser.")
-    write_page(options, {scenes.name: scenes.reference, **scenes.others})
+    write_page(options, scenes)
 
 
 def add_tradeoff(add_parser: AddParser) -> None:
