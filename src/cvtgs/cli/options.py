@@ -308,11 +308,10 @@ def read_settings(words: Sequence[str] = (), effects: str | None = None) -> dict
     settings = {f"effects.{name}": value for name, value in forced.items()}
     settings |= _assignments(words, "--set needs KEY=VALUE, for example cvt.iterations=10")
     known = list(_setting_names(cvtgs.SimplifyConfig))
-    there = [key.removeprefix("effects.") for key in known if key.startswith("effects.")]
-    for key in settings:
-        nearest = "" if key in known else suggestion(key, known, likeness=SETTING_LIKENESS)
-        if key.startswith("effects.") and key not in known and not nearest:
-            nearest = f"; there are {', '.join(there)}."
+    for key in (key for key in settings if key not in known):
+        nearest = suggestion(key, known, likeness=SETTING_LIKENESS)
+        if key.startswith("effects.") and not nearest:
+            nearest = f"; there are {', '.join(cvtgs.config.EffectsConfig.model_fields)}."
         if nearest:  # otherwise the configuration reports the unknown key
             raise ConfigError(f"{key}: is not a known setting{nearest}")
     return settings
