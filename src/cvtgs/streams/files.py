@@ -144,23 +144,20 @@ def join_levels(parts: Sequence[StreamPart]) -> tuple[StreamLevel, ...]:
 
 def join_trees(
     parts: Sequence[StreamPart],
-    leaf: Callable[[int], dict[str, Any]],
+    leaves: Sequence[dict[str, Any]],
     inner: Callable[[Corner, Corner, list[dict[str, Any]]], dict[str, Any]],
 ) -> dict[str, Any]:
     """Build the tree above parts and return its root; a node has half of the parts of its parent.
 
-    ``leaf`` returns the node of a part by its number; ``inner`` an inner node from the corners of
-    its box and its children.
+    ``leaves`` are the nodes of the parts; ``inner`` returns an inner node from the corners of its
+    box and its children.
     """
-
-    def node(numbers: range) -> dict[str, Any]:
-        if len(numbers) == 1:
-            return leaf(numbers[0])
-        middle = len(numbers) // 2
-        low, high = join_boxes((parts[k].box_min, parts[k].box_max) for k in numbers)
-        return inner(low, high, [node(numbers[:middle]), node(numbers[middle:])])
-
-    return node(range(len(parts)))
+    if len(parts) == 1:
+        return leaves[0]
+    low, high = join_boxes((part.box_min, part.box_max) for part in parts)
+    middle = len(parts) // 2
+    halves = (slice(None, middle), slice(middle, None))
+    return inner(low, high, [join_trees(parts[half], leaves[half], inner) for half in halves])
 
 
 def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool = False) -> None:

@@ -86,7 +86,8 @@ class SogFormat:
     def index(self, parts: Sequence[StreamPart], folder: Path) -> dict[str, Any]:
         """Return the content of ``lod-meta.json``, and write the environment of all parts."""
         counts = [level.gaussians for level in join_levels(parts)]
-        before = list(accumulate((len(part.names) for part in parts), initial=0))
+        firsts = accumulate((len(part.names) for part in parts), initial=0)
+        leaves = [_shifted(part.tree, first) for part, first in zip(parts, firsts, strict=False)]
         scenes = [load(folder / name, trust_sizes=True) for name in _far_files(parts)]
         more = {}
         if scenes:
@@ -101,7 +102,7 @@ class SogFormat:
             "lodLevels": len(counts),
             "lodErrors": False,
             "filenames": [name for part in parts for name in part.names],
-            "tree": join_trees(parts, lambda part: _shifted(parts[part].tree, before[part]), _node),
+            "tree": join_trees(parts, leaves, _node),
         }
 
 

@@ -101,7 +101,7 @@ class TilesFormat:
     def index(self, parts: Sequence[StreamPart], folder: Path) -> dict[str, Any]:
         """Return the content of ``tileset.json``; tiles share no other file."""
         low, high = join_boxes((part.box_min, part.box_max) for part in parts)
-        root = join_trees(parts, lambda part: parts[part].tree, _parent)
+        root = join_trees(parts, [part.tree for part in parts], _parent)
         to_place = _matrix(_UNMOVED if self.transform is None else self.transform)
         scale = float(to_place[:3, :3].norm(dim=0).max())  # of the root's own error, for viewers
         extensions = {"extensionsUsed": [SPLATS, SPZ], "extensionsRequired": [SPLATS, SPZ]}
