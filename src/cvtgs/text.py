@@ -84,13 +84,8 @@ def size_text(count: int) -> str:
     return f"{value:.1f} GB"
 
 
-def padded(text: str, width: int) -> str:
-    """Pad a text to a width in columns of a terminal, where wide characters take two."""
-    return text + " " * (width - columns(text))
-
-
 def columns(text: str) -> int:
-    """Return the number of columns that a text takes in a terminal."""
+    """Return the columns that a text takes in a terminal; wide characters take two."""
     wide = sum(east_asian_width(letter) in "FW" for letter in text)
     return len(text) + wide - sum(map(bool, map(combining, text)))
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TextIO
 
 from cvtgs.errors import OutputError, reason_of
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.text import columns, counted, padded, printable
+from cvtgs.text import columns, counted, printable
 
 if TYPE_CHECKING:
     from cvtgs.budget import Found
@@ -72,8 +72,9 @@ def say_table(rows: Sequence[Sequence[str]]) -> None:
     """Print rows of cells; the first column is aligned to the left, the others to the right."""
     widths = [max(map(columns, column)) for column in zip(*rows, strict=True)]
     for first, *others in rows:
+        space = " " * (widths[0] - columns(first))
         cells = (f"{text:>{width}}" for text, width in zip(others, widths[1:], strict=True))
-        say(f"  {padded(first, widths[0])}  {'  '.join(cells)}".rstrip())
+        say(f"  {first}{space}  {'  '.join(cells)}".rstrip())
 
 
 @contextmanager
