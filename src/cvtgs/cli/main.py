@@ -101,8 +101,7 @@ def _run(words: Sequence[str], stop: "_Stop") -> None:
         raise
     otherwise = BLOCKS_ADVICE if hasattr(options, "memory") else "ask for less"
     advice = f"free some, or {otherwise}, and use --device cpu if a GPU ran out"
-    advised = memory_errors(f"cvtgs {options.command}", advice)
-    with advised:
+    with memory_errors(f"cvtgs {options.command}", advice):
         if options.command != "completion":  # needs no tensors, and starts faster without them
             with stop.held():  # an interrupted import of torch may end in its C++ code
                 load_torch()

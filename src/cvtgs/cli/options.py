@@ -245,8 +245,8 @@ class CommandParser(argparse.ArgumentParser):
         wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
         if wrong:
             message += suggestion(wrong[1], re.findall(r"[\w-]+", wrong[2]))
-        message = re.sub("invalid int value: ", "must be a whole number, found ", message)
-        message = re.sub("invalid float value: ", "must be a number, found ", message)
+        message = message.replace("invalid int value: ", "must be a whole number, found ")
+        message = message.replace("invalid float value: ", "must be a number, found ")
         lacks = re.fullmatch(r"argument (?:.*/)?(--[\w-]+): expected one argument", message)
         for option, value in pairwise(self._words):
             if lacks and option == lacks[1] and re.match(r"-[\d.]", value):
