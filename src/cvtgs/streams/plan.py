@@ -232,9 +232,11 @@ def _parents(level: StreamedLevel, coarsest: StreamedLevel) -> Int[Tensor, "m"]:
     own = _assignment(level)
     both = (own >= 0) & (coarse >= 0)
     pairs, votes = torch.unique(own[both] * wide + coarse[both], return_counts=True)
-    order = torch.sort(votes, stable=True).indices  # later writes win: the most votes come last
     parents = torch.full((count,), -1)
-    parents[pairs[order] // wide] = pairs[order] % wide
+    if len(pairs):
+        ranks = votes * len(pairs) + torch.arange(len(pairs))  # no two are equal
+        best = parents.scatter_reduce(0, pairs // wide, ranks, "amax")
+        parents = torch.where(best < 0, -1, pairs[best % len(pairs)] % wide)
     missing = (parents < 0).nonzero()[:, 0]  # the coarsest level left out all of their rows
     if len(missing):
         means, sites = level.scene.means.cpu(), coarsest.scene.means.cpu()
