@@ -126,7 +126,7 @@ def report_notes(report: "SimplifyReport") -> list[str]:
         notes.append(f"{report.device_note}.")
     if report.blocks > 1:
         resumed = f", {report.resumed_blocks} of them from an earlier run"
-        notes.append(f"In {report.blocks} blocks{resumed * (report.resumed_blocks > 0)}.")
+        notes.append(f"In {report.blocks} blocks{resumed if report.resumed_blocks else ''}.")
     if report.shortfall:
         notes.append(shortfall_note(report))
     if report.config.uses_images and report.views == "none":
