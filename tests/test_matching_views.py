@@ -1,5 +1,7 @@
 """Images that a matching holds out, and scenes far from the origin."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -10,6 +12,7 @@ from cvtgs.matching import (
     heldout_rows,
     heldout_views,
     linear_view,
+    match_views,
     with_deeper_opacities,
 )
 from cvtgs.rendering import observe, render
@@ -19,10 +22,26 @@ from scenes import random_scene, same_bits
 
 @pytest.mark.parametrize(("count", "held"), [(7, []), (8, [4]), (12, [4]), (13, [4, 12])])
 def test_every_eighth_image_is_held_out_and_none_of_fewer(count: int, held: list[int]) -> None:
-    assert list(heldout_rows(count)) == held
+    assert list(heldout_rows(torch.ones(count, 2, 2))) == held
     views = heldout_views(observe(random_scene(3, degree=0), ring(count)))
     wanted = ring(count).viewmats[held or slice(None)]
     assert torch.equal(views.cameras.viewmats, wanted)
+
+
+def test_an_image_of_nothing_is_never_held_out() -> None:
+    """Every scene has that image, so none would be better than the first."""
+    scene, cameras = random_scene(60, degree=0), ring(12)
+    viewmats = cameras.viewmats.clone()
+    viewmats[4] = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])).to(viewmats) @ viewmats[4]
+    views = observe(scene, replace(cameras, viewmats=viewmats))
+    assert views.alpha.amax(dim=(1, 2))[4] == 0
+    assert list(heldout_rows(views.alpha)) == [5]
+    dark = scene.with_tensors({"sh0": scene.sh0 - 1}, {})
+    config = MatchConfig(opacity_rounds=1, color_iterations=6)
+    report = match_views(dark, views, views.contributions, config=config).report
+    assert report.heldout == 1
+    assert report.psnr_after > report.psnr_before + 1
+    assert report.psnr_before < 40
 
 
 def test_a_scene_that_no_image_shows_keeps_its_colors() -> None:

@@ -19,7 +19,7 @@ from cvtgs.math import parameters
 from cvtgs.math.segments import segment_sum
 from cvtgs.math.spherical_harmonics import SH_C0, evaluate, rest_basis
 from cvtgs.rendering import BlendingWeights, ObservedViews, blending_weights, contributions, render
-from cvtgs.rendering.render import check_observed
+from cvtgs.rendering.render import check_observed, showing_rows
 from cvtgs.report import MatchReport
 from cvtgs.scene import GaussianScene
 
@@ -84,8 +84,9 @@ def fit_colors(
     With the geometry fixed, an image is ``A c``: ``A`` holds the weights ``alpha * T`` times the
     SH basis. The changes ``x`` of the coefficients minimize ``|A x - r|^2 + |L x|^2``, where ``r``
     is the residual of the images. The ridge ``L`` grows with the weight of a Gaussian and is
-    stronger for view-dependent bands. Every eighth image is held out: if the full changes help
-    there, all images are used, else they are scaled down to the best step. Not part of CVT-GS.
+    stronger for view-dependent bands. Every eighth image that shows something is held out: if the
+    full changes help there, all images are used, else they are scaled down to the best step. Not
+    part of CVT-GS.
 
     Memory: the blending weights of all images, and six times the colours.
 
@@ -121,7 +122,7 @@ def fit_colors(
         linear_view(small, camera, image)
         for camera, image in zip(views.cameras.singles(), views.rgb, strict=True)
     ]
-    rows = heldout_rows(len(linear))
+    rows = heldout_rows(views.alpha)
     heldout = [linear[row] for row in rows]
     seen = [view for row, view in enumerate(linear) if row not in rows]
     problem = LeastSquares(seen, config=config, frozen=frozen)
@@ -137,9 +138,10 @@ def fit_colors(
     return small.with_tensors(tensors)
 
 
-def heldout_rows(count: int) -> range:
-    """Return the row numbers of the held-out images: every eighth, none of fewer than eight."""
-    return range(HELDOUT_EVERY // 2, count if count >= HELDOUT_EVERY else 0, HELDOUT_EVERY)
+def heldout_rows(alpha: Float[Tensor, "c h w"]) -> Sequence[int]:
+    """Return the rows of held-out images: every eighth that shows something, none of fewer."""
+    shown = showing_rows(alpha)
+    return shown[HELDOUT_EVERY // 2 :: HELDOUT_EVERY] if len(shown) >= HELDOUT_EVERY else []
 
 
 def best_step(views: Sequence[LinearView], changes: Float[Tensor, "m k 3"]) -> float:
@@ -264,7 +266,7 @@ def match_views(
     """Match a merged scene to images of the full one: opacities first, then colours.
 
     The new opacities are kept if they lower the mean squared error of the held-out images: every
-    eighth, or all if there are fewer than eight. See :func:`fit_colors` for the colours.
+    eighth that shows something, or all if there are fewer. See :func:`fit_colors` for the colours.
 
     Args:
         small: The merged scene.
@@ -364,9 +366,9 @@ def with_deeper_opacities(small: GaussianScene, factors: Float[Tensor, "m"]) -> 
 
 
 def heldout_views(views: ObservedViews) -> ObservedViews:
-    """Return every eighth view, or all views if there are fewer than eight."""
-    count = len(views.cameras)
-    rows = torch.tensor(heldout_rows(count) or range(count), device="cpu")
+    """Return every eighth view that shows something, or all views if there are fewer."""
+    held = heldout_rows(views.alpha) or range(len(views.cameras))
+    rows = torch.tensor(held, device="cpu")
     cameras = views.cameras.select(rows)
     return replace(views, cameras=cameras, rgb=views.rgb[rows], alpha=views.alpha[rows])
 

@@ -55,9 +55,9 @@ def render(options: argparse.Namespace) -> None:
     import torch
 
     from cvtgs.devices import chosen_device
-    from cvtgs.evaluation.blind_views import LEAST_COVER
     from cvtgs.evaluation.images import as_bytes, encode
     from cvtgs.io.atomic import make_folder
+    from cvtgs.rendering.render import LEAST_COVER
 
     check_view_options(options)
     background = background_color(options)

@@ -11,12 +11,12 @@ from cvtgs.evaluation.scorer import render_views
 from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.rendering import BackendName
 from cvtgs.rendering.projection import to_matrices, warn_of_near_plane
+from cvtgs.rendering.render import LEAST_COVER
 from cvtgs.scene import GaussianScene
 from cvtgs.views.own import FEW, LEAST_FILLED, MOST_TRIED, in_images
 
 PREVIEW = 96  # longer side of images that only tell whether they show anything, pixels
 SAMPLED = 4096  # about how many Gaussians tell whether a camera sees anything of a scene
-LEAST_COVER = 1e-4  # mean alpha that one image must reach if all centres are outside every image
 
 
 def check_seen(

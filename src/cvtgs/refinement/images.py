@@ -11,10 +11,11 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.config import RefineConfig
-from cvtgs.evaluation.blind_views import LEAST_COVER, seeing_rows
+from cvtgs.evaluation.blind_views import seeing_rows
 from cvtgs.evaluation.scorer import ViewImages, render_views
 from cvtgs.losses import SSIM_WINDOW
 from cvtgs.rendering import ObservedViews
+from cvtgs.rendering.render import showing_rows
 from cvtgs.scene import GaussianScene
 from cvtgs.views import find_view_positions, mixed_views
 
@@ -82,8 +83,7 @@ def shared_views(
     rgb, alpha = observed.rgb.to(full.device), observed.alpha.to(full.device)
     whole = ViewImages(cameras=observed.cameras, rgb=rgb, alpha=alpha)
     images = [whole.select(row) for row in range(len(observed.cameras))]
-    shown = (alpha.flatten(1).mean(dim=1) >= LEAST_COVER).nonzero()[:, 0].tolist()
-    held = _heldout_rows(shown if len(shown) > 1 else range(len(images)), config)
+    held = _heldout_rows(showing_rows(alpha), config)
     further = _further(observed.cameras, full, cameras, config=config, seed=seed)
     return RefineViews(
         heldout=(),

@@ -26,6 +26,7 @@ from cvtgs.scene import GaussianScene, SceneLike, as_scene, check_scene
 from cvtgs.text import counted, short_repr, shown
 
 LEAST_ERROR = 1e-12  # mean squared error below which images count as equal
+LEAST_COVER = 1e-4  # mean alpha from which on an image shows something
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -201,6 +202,15 @@ class ObservedViews:
     backend: str
 
     __repr__ = short_repr
+
+
+def showing_rows(alpha: Float[Tensor, "c h w"]) -> Sequence[int]:
+    """Return the rows of images that show something; all if fewer than two do.
+
+    An image of nothing would look perfect from the start, so it must not decide on a result.
+    """
+    found: list[int] = (alpha.flatten(1).mean(dim=1) >= LEAST_COVER).nonzero()[:, 0].tolist()
+    return found if len(found) > 1 else range(len(alpha))
 
 
 def check_observed(views: object, name: str) -> None:
