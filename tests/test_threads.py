@@ -124,11 +124,21 @@ def test_threads_are_left_to_chunks(two_threads):
         assert set(in_threads(threads, range(4), HOST)) == {(threading.get_ident(), 1)}
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("policy", ["ACTIVE", "PASSIVE"])
+def test_torch_never_splits_an_operation_of_a_simplification(two_threads, monkeypatch, policy):
+    """Where its parts start changes last bits, of logistic functions and of sums."""
+    monkeypatch.setenv("OMP_WAIT_POLICY", policy)  # idle threads sleep, as on the command line
+    counts = set()
+    simplifier = cvtgs.Simplifier(
+        device="cpu", listener=lambda _: counts.add(torch.get_num_threads())
+    )
+    simplifier.simplify(cvtgs.synthetic.scene("object", 500, sh_degree=0, seed=0), 0.1)
+    assert (counts, torch.get_num_threads()) == ({1}, 2)
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("preset", ["draft", "standard", "paper", "matched", "high"])
-def test_results_do_not_depend_on_the_number_of_threads(two_threads, monkeypatch, preset, policy):
-    monkeypatch.setenv("OMP_WAIT_POLICY", policy)  # on the command line, torch keeps its threads
+def test_results_do_not_depend_on_the_number_of_threads(two_threads, preset):
     sections = {"refine": {"steps": 4}} if preset == "high" else {}
     config = cvtgs.SimplifyConfig.from_mapping({"preset": preset, **sections})
     scene = cvtgs.synthetic.scene("courtyard", 40_000, sh_degree=1, seed=0)

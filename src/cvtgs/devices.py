@@ -8,7 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TypeVar
@@ -361,10 +361,11 @@ def one_thread() -> Iterator[int]:
 def threads_for_chunks() -> Iterator[None]:
     """Leave the threads of torch to chunks (:func:`in_threads`) and to compiled loops.
 
-    After every operation, the threads of torch wait for one another, and spin meanwhile. If other
+    Each thread of torch takes a part of an operation, and where a part starts changes the last bit
+    of some exponentials and sums; chunks have the same length for any number of threads. After
+    every operation, the threads of torch wait for one another, and spin meanwhile. If other
     programs use the cores, each wait may last as long as a turn of theirs, some milliseconds, and
-    a call ten times as long as with one thread. Threads for chunks rarely wait. Sums of images then
-    do not depend on the number of threads.
+    a call ten times as long as with one thread. Threads for chunks rarely wait.
     """
     if _OWN.is_limited:
         yield
@@ -375,17 +376,6 @@ def threads_for_chunks() -> Iterator[None]:
             yield
         finally:
             _OWN.for_chunks = 1
-
-
-@contextmanager
-def without_spinning() -> Iterator[None]:
-    """Leave the threads of torch to chunks, unless idle ones soon sleep instead of spinning.
-
-    They do on the command line (``startup.py``); results must not depend on their number.
-    """
-    sleeps = os.environ.get("OMP_WAIT_POLICY", "").upper() == "PASSIVE"
-    with nullcontext() if sleeps else threads_for_chunks():
-        yield
 
 
 def kernel_threads() -> int:

@@ -9,6 +9,7 @@ from cvtgs.analysis.effects import select_columns
 from cvtgs.checks import checked
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
+from cvtgs.devices import threads_for_chunks
 from cvtgs.errors import InvalidSceneError
 from cvtgs.math import parameters
 from cvtgs.math.segments import running_sums
@@ -69,6 +70,7 @@ HEAVIEST = (0.001, 0.01, 0.1, 0.5)
 
 
 @torch.no_grad()
+@threads_for_chunks()
 @checked
 def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInfo:
     """Collect facts about a scene.

@@ -21,7 +21,6 @@ from cvtgs.devices import (
     threads_for_chunks,
     within_memory,
     without_autocast,
-    without_spinning,
 )
 from cvtgs.edit import concatenate
 from cvtgs.errors import BLOCKS_ADVICE, InvalidArgumentError, memory_errors
@@ -142,7 +141,7 @@ class Prepared:
 
         work = f"simplifying {len(self._scene):,} Gaussians"
         with (
-            threads_for_chunks() if self._config.uses_images else without_spinning(),
+            threads_for_chunks(),
             torch.inference_mode(mode=False),
             torch.no_grad(),
             without_autocast(),

@@ -12,7 +12,7 @@ from typing import BinaryIO, Literal
 import numpy as np
 import torch
 
-from cvtgs.devices import usable_device, without_spinning
+from cvtgs.devices import threads_for_chunks, usable_device
 from cvtgs.errors import (
     BLOCKS_ADVICE,
     DroppedDataWarning,
@@ -175,7 +175,7 @@ def load(
         return scene.to(device)
 
 
-@without_spinning()
+@threads_for_chunks()
 def save(
     scene: GaussianScene,
     path: str | os.PathLike[str] | ByteSink,
