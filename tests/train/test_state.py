@@ -350,7 +350,8 @@ def test_before_the_first_validation():
 def test_json_and_back_keeps_every_digit():
     history = history_of(0.0, 0.1 + 0.2, -1e-300)
     history.validations.append(Validation(step=30, loss=1 / 3, gains=GAINS))
-    again = History.from_list(json.loads(json.dumps(history.to_list())))
+    history.validations.append(Validation(step=40, loss=math.nan, gains=GAINS))
+    again = History.from_list(json.loads(json.dumps(history.to_list(), allow_nan=False)))
     assert repr(again.validations) == repr(history.validations)
     assert again.to_list()[1:] == history.to_list()[1:]
     assert History.from_list(History().to_list()).validations == []

@@ -157,7 +157,7 @@ class History:
         Returns:
             Lists, numbers and strings, for :meth:`from_list`.
         """
-        values: list[Any] = _VALIDATIONS.dump_python(self.validations, mode="json")
+        values: list[Any] = json.loads(_VALIDATIONS.dump_json(self.validations))  # NaN as text
         return values
 
     @classmethod
