@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+import cvtgs
 from cvtgs import Simplifier, load, save
 from cvtgs.cli.main import main
 from cvtgs.io import Losses, losses
@@ -206,3 +207,17 @@ def test_a_version_of_spz_needs_an_spz(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(words) == 1
     assert "--spz-version needs a .spz to write, found a.glb." in capsys.readouterr().err
     assert not (tmp_path / "a.glb").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [["--sh-degree", "0"], ["--effects", "sh=0"], []])
+def test_a_searched_scene_has_the_columns_of_a_given_count(
+    tmp_path: Path, words: list[str]
+) -> None:
+    source, found, given = (tmp_path / name for name in ("a.ply", "b.ply", "c.ply"))
+    save(cvtgs.synthetic.scene("object", 300, sh_degree=1, seed=0), source)
+    words = ["--preset", "draft", "--quiet", *words]
+    assert main(["simplify", str(source), str(found), "--target-psnr", "12", *words]) == 0
+    count = len(load(found))
+    assert main(["simplify", str(source), str(given), "--count", str(count), *words]) == 0
+    assert found.read_bytes() == given.read_bytes()

@@ -267,8 +267,8 @@ def _simplify_in_memory(
             options, scene, simplifier, cameras=cameras, axes=axes.target, listener=listener
         )
         small, report = found.scene, found.report
-        if isinstance(config.effects.sh, int):
-            small = small.with_sh_degree(config.effects.sh)
+        if options.sh_degree is not None:
+            small = small.with_sh_degree(options.sh_degree)
         notes.append(scores)
     else:
         keep = None
