@@ -280,3 +280,21 @@ def test_ssim_of_even_images_is_no_rounding_error(bright, dark):
     one[:, :16] = dark
     found, exact = (float(mean_ssim(image, image - 1e-3)) for image in (one, one.double()))
     assert found == pytest.approx(exact, abs=1e-4 if dark != bright else 2e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("loss", [*LOSSES, relative_loss])
+def test_losses_of_16_bit_images_are_those_of_32_bits(loss, dtype) -> None:
+    """In float16, a sum over an image overflows, and a product of two small numbers is 0."""
+    stripes = (torch.arange(160) % 2).to(dtype)[None, None, :, None].expand(1, 160, 160, 3)
+    black = torch.zeros_like(stripes)
+    for first, second in ((stripes, black), (black, black), (black + 0.02, black)):
+        prediction, wide = (
+            first.detach().to(kind, copy=True).requires_grad_() for kind in (dtype, torch.float32)
+        )
+        found, wanted = loss(prediction, second), loss(wide, second.float())
+        assert found.dtype == torch.float32
+        assert torch.equal(found, wanted)
+        found.backward()
+        wanted.backward()
+        assert torch.equal(prediction.grad, wide.grad.to(dtype))

@@ -1,4 +1,4 @@
-"""Losses between rendered images and their targets."""
+"""Losses between rendered images and their targets; of 16-bit images, they are float32."""
 
 from functools import cache
 from typing import Any
@@ -44,7 +44,7 @@ def l1_loss(
         0.25
     """
     check_pair(prediction, target)
-    return _l1(prediction, target).mean()
+    return _l1(*_widened(prediction, target)).mean()
 
 
 def _l1(prediction: Tensor, target: Tensor) -> Float[Tensor, "c"]:
@@ -87,6 +87,7 @@ def mean_ssim(
     of one stack of images, 32 with the gradient.
     """
     check_pair(prediction, target, least=SSIM_WINDOW)
+    prediction, target = _widened(prediction, target)
     center = target.detach().mean(dim=(1, 2), keepdim=True)
     return _ssim(prediction - center, target - center, center=center.permute(0, 3, 1, 2))
 
@@ -155,7 +156,7 @@ def gradient_loss(
         0.5
     """
     check_pair(prediction, target)
-    return _gradient(prediction, target).mean()
+    return _gradient(*_widened(prediction, target)).mean()
 
 
 def _gradient(prediction: Tensor, target: Tensor) -> Float[Tensor, "c"]:
@@ -203,6 +204,7 @@ def image_loss(
         raise InvalidArgumentError(f"ssim_weight must be from 0 to 1, found {ssim_weight!r}.")
     _check_weights(gradient_weight=gradient_weight)
     check_pair(prediction, target, least=SSIM_WINDOW if ssim_weight else 1)
+    prediction, target = _widened(prediction, target)
     dissimilarity = 1 - _ssim(prediction, target) if ssim_weight else 0.0
     return _image_loss(prediction, target, dissimilarity, ssim_weight, gradient_weight).mean()
 
@@ -244,6 +246,7 @@ def relative_loss(
     _check_weights(mse_weight=mse_weight, image_weight=image_weight, ssim_weight=ssim_weight)
     uses_ssim = bool(image_weight or ssim_weight)
     check_pair(prediction, target, least=SSIM_WINDOW if uses_ssim else 1)
+    prediction, target = _widened(prediction, target)
     loss = prediction.new_zeros(len(prediction))
     if mse_weight:
         squared = (prediction - target).square().mean(dim=(1, 2, 3))
@@ -275,6 +278,12 @@ def _image_loss(
 def _check_weights(**weights: float) -> None:
     for name, weight in weights.items():
         check_not_negative(weight, name)
+
+
+def _widened(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Return images of at least 32 bits per number, in which no sum overflows."""
+    wide = torch.promote_types(prediction.dtype, torch.float32)
+    return prediction.to(wide), target.to(wide)
 
 
 def check_pair(

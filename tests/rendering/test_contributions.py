@@ -298,3 +298,15 @@ def test_colours_and_images_of_other_sizes_are_refused(backend):
         shape = rf"of shape \({height}, {width}, 3\)"
         with pytest.raises(InvalidArgumentError, match=f"^image must .* {shape}"):
             weights.collect(wrong)
+
+
+@backends
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_weights_take_colours_and_images_of_any_dtype(backend, dtype):
+    scene, camera = random_scene(12, degree=0, dtype=torch.float64), one_camera(20, 18)
+    weights = blending_weights(scene, camera, backend=backend)
+    colors = torch.rand(12, 3, generator=torch.Generator().manual_seed(0)).to(dtype)
+    image = weights.paint(colors)
+    assert torch.allclose(image.double(), weights.paint(colors.double()).double(), atol=1e-6)
+    collected, normal = weights.collect(image.to(dtype)), weights.normal(colors)
+    assert torch.allclose(collected.double(), normal.double(), atol=1e-4)

@@ -61,7 +61,7 @@ def ssim(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tens
     """
     check_pair(a, b, least=SSIM_WINDOW)
     pairs = zip(a.clamp(0, 1).split(1), b.clamp(0, 1).split(1), strict=True)
-    return torch.cat([mean_ssim(one, other) for one, other in pairs]).clamp(max=1)
+    return torch.cat([mean_ssim(one, other) for one, other in pairs]).clamp(max=1).to(a.dtype)
 
 
 @torch.no_grad()

@@ -244,13 +244,14 @@ class PixelWeights:
     def paint(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
         """Return the image for these colours of the Gaussians."""
         check_colors(colors, self._count)
+        colors = colors.to(self._weights.dtype)
         image = segments.segment_sum_of(colors, self._row_of, self._pixel_starts, self._weight_of)
         return image.reshape(self._size[1], self._size[0], 3)
 
     def collect(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Return, for every Gaussian, the sum of the pixels times its weights."""
         check_image(image, self._size)
-        flat = image.reshape(-1, 3)
+        flat = image.reshape(-1, 3).to(self._weights.dtype)
         return segments.segment_sum_of(flat, self._pixels, self._row_starts, self._weights)
 
     def normal(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
