@@ -120,9 +120,9 @@ def evaluate(
         The scores, per view and on average.
 
     Raises:
-        InvalidArgumentError: There is no camera, or none sees anything of the full scene; two
-            scenes share a name, or the photographs do not have the shape of the images or are no
-            floats in [0, 1].
+        InvalidArgumentError: There is no camera, none sees anything of the full scene, or images
+            have fewer than 11 x 11 pixels; two scenes share a name, or the photographs do not have
+            the shape of the images or are no floats in [0, 1].
         InvalidSceneError: The full scene has no Gaussian.
         DeviceError: The backend does not work on a scene's device.
         MissingDependencyError: The backend's package or the chosen LPIPS is missing.

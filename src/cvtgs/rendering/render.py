@@ -293,7 +293,7 @@ def error_shares(
         backend: The backend, as in :func:`cvtgs.rendering.render`.
 
     Returns:
-        Shares in pixels, float64; 0 for Gaussians that no image shows.
+        Shares in pixels, float64; 0 for Gaussians that no image shows or that are drawn black.
 
     Raises:
         InvalidArgumentError: ``views`` are no observed views, or there is no such backend.
