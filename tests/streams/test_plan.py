@@ -52,19 +52,14 @@ def test_a_gaussian_is_in_the_chunk_of_the_coarse_one_with_most_of_its_rows(owne
     assert [0 in own[0].tolist() for own in rows] == [chunk == 0, chunk == 1]
 
 
-def test_any_number_of_threads_plans_the_same_chunks():
+def test_any_number_of_threads_plans_the_same_chunks(two_threads):
     """Each fine Gaussian replaces three rows, two of them of one coarse Gaussian."""
     some, others = torch.randint(200, (2, 200_000), generator=torch.Generator().manual_seed(0))
     coarse_owners = torch.stack([some, some, others], dim=1).flatten()
     fine_owners = torch.arange(200_000).repeat_interleave(3)
     fine = level([0.0] * 200_000, fine_owners.tolist())
     coarse = level([float(place) for place in range(200)], coarse_owners.tolist())
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
-        chunks = planned(fine, coarse, most=1).chunks
-    finally:
-        torch.set_num_threads(threads)
+    chunks = planned(fine, coarse, most=1).chunks
     for own in chunks:
         assert torch.equal(own.rows[0], (some == own.rows[1]).nonzero()[:, 0])
     assert sum(len(own.rows[0]) for own in chunks) == 200_000
