@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
 import pydantic
@@ -53,7 +53,7 @@ class StageClock:
         check_listener(listener)
         self._listener = listener
         self._device = device
-        self._costs: dict[str, StageCost] = {}
+        self._costs: list[StageCost] = []
 
     @contextmanager
     def stage(self, name: str, total: int = 1) -> Iterator[Callable[[int], None]]:
@@ -79,22 +79,40 @@ class StageClock:
         yield advance
         if on_cuda:
             torch.cuda.synchronize(self._device)
-        nothing = StageCost(stage=name, seconds=0.0, cpu_seconds=0.0, peak_memory_bytes=0)
-        before = self._costs.get(name, nothing)
-        peak = torch.cuda.max_memory_allocated(self._device) if on_cuda else 0
-        self._costs[name] = StageCost(
+        cost = StageCost(
             stage=name,
-            seconds=before.seconds + time.perf_counter() - wall,
-            cpu_seconds=before.cpu_seconds + time.process_time() - cpu,
+            seconds=time.perf_counter() - wall,
+            cpu_seconds=time.process_time() - cpu,
             peak_memory_bytes=peak_memory_bytes(),
-            peak_device_memory_bytes=max(before.peak_device_memory_bytes, peak),
+            peak_device_memory_bytes=(
+                torch.cuda.max_memory_allocated(self._device) if on_cuda else 0
+            ),
         )
+        self._costs.append(cost)
         send(total)
 
     @property
     def costs(self) -> list[StageCost]:
         """The costs of the stages so far, in the order of their first runs."""
-        return list(self._costs.values())
+        return join_costs(self._costs)
+
+
+def join_costs(costs: Iterable[StageCost]) -> list[StageCost]:
+    """Add the costs of stages that ran several times, in the order of their first runs."""
+    joined: dict[str, StageCost] = {}
+    for cost in costs:
+        before = joined.setdefault(cost.stage, cost)
+        if before is not cost:
+            joined[cost.stage] = StageCost(
+                stage=cost.stage,
+                seconds=before.seconds + cost.seconds,
+                cpu_seconds=before.cpu_seconds + cost.cpu_seconds,
+                peak_memory_bytes=max(before.peak_memory_bytes, cost.peak_memory_bytes),
+                peak_device_memory_bytes=max(
+                    before.peak_device_memory_bytes, cost.peak_device_memory_bytes
+                ),
+            )
+    return list(joined.values())
 
 
 def peak_memory_bytes() -> int:

@@ -24,7 +24,8 @@ class RefineReport(Record):
 
     Attributes:
         steps: Number of steps.
-        images: Number of images of the full scene that were rendered for training.
+        images: Number of images of the full scene that were rendered for training; 0 if those of
+            the matching were enough.
         heldout: Number of held-out views, which decide what is kept.
         psnr_before: Mean PSNR of the input scene over the held-out views, dB; each view counts at
             most 10 dB above their median.
@@ -166,7 +167,7 @@ class SimplifyReport(CellStatistics):
         views: Origin of the views of rendered images: ``N cameras`` that were given or found with
             the file, ``found`` by cvtgs, or ``none`` without images.
         plan: The effects that the scene called for.
-        stages: Cost of each stage.
+        stages: Cost of each stage; of a search for the count, the sum over all counts it tried.
         matching: Report of the matching to images; None if there was none.
         refinement: Report of the refinement; None if there was none.
         search: Report of the search for the count; None if it was given.

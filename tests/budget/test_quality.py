@@ -201,6 +201,20 @@ def test_the_scene_is_analysed_once(full, views, simplifier, monkeypatch):
     assert same_bits(found.scene, simplifier.simplify(full, count=len(found.scene)))
 
 
+def test_the_stages_are_those_of_all_tries(full, views, simplifier):
+    """Scoring is a stage, too, and each stage occurs once."""
+    found = find_count(full, psnr=20.0, simplifier=simplifier, heldout=views)
+    assert len(found.tried) > 1
+    names = [cost.stage for cost in found.report.stages]
+    assert (names[0], names[1], names[-1]) == ("check", "plan", "score")
+    assert len(names) == len(set(names))
+    again = simplifier.prepare(full)
+    runs = [again.run(count=one.count).report.stages for one in found.tried]
+    peaks = [max(cost.peak_memory_bytes for cost in costs) for costs in runs]
+    assert max(cost.peak_memory_bytes for cost in found.report.stages) <= max(peaks)
+    assert {cost.stage for costs in runs for cost in costs} == set(names) - {"score"}
+
+
 def test_a_goal_out_of_reach_is_an_error(full, views, simplifier):
     with pytest.raises(GoalError) as caught:
         find_count(full, psnr=60.0, simplifier=simplifier, heldout=views)

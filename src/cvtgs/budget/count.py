@@ -9,7 +9,7 @@ from cvtgs.budget.calibrate import CANDIDATES, cost_model
 from cvtgs.budget.costs import CostModel, Work
 from cvtgs.cameras import Cameras
 from cvtgs.checks import checked
-from cvtgs.clock import check_listener
+from cvtgs.clock import StageClock, StageCost, check_listener, join_costs
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import real_number, target_count
 from cvtgs.errors import GoalError, InvalidArgumentError, InvalidSceneError, warn
@@ -23,6 +23,7 @@ from cvtgs.text import shown
 from cvtgs.views import automatic_views
 
 STAGE = "search"
+SCORE = "score"  # the stage of the held-out views, in the report
 
 HELDOUT_SEED = 307
 """Seed of the views for presets that use images: none of them is of a preset or refinement."""
@@ -165,14 +166,19 @@ def find_count(
     if heldout is None:
         seed = HELDOUT_SEED if simplifier.config.uses_images else 0
         heldout = automatic_views(full, VIEWS, width=WIDTH, height=HEIGHT, seed=seed)
-    scorer = heldout_scorer(full, heldout, listener=listener)
+    clock = StageClock(silent, full.device)
+    with clock.stage(SCORE):
+        scorer = heldout_scorer(full, heldout, listener=listener)
     tried: list[Tried] = []
+    costs: list[StageCost] = []
     best: tuple[Simplified, Tried] | None = None
 
     def reach(count: int) -> float:
         nonlocal best
         made = prepared.run(count=count)
-        tried.append(heldout_quality(scorer, written(made.scene), count=count))
+        costs.extend(made.report.stages)
+        with clock.stage(SCORE):
+            tried.append(heldout_quality(scorer, written(made.scene), count=count))
         value = target.of(tried[-1])
         if value >= target.value and (best is None or len(made.scene) < len(best[0].scene)):
             best = made, tried[-1]
@@ -202,7 +208,8 @@ def find_count(
         count=quality.count,
         **scores,
     )
-    report = report.model_copy(update={"search": search})
+    stages = tuple(join_costs([*costs, *clock.costs]))
+    report = report.model_copy(update={"search": search, "stages": stages})
     return Found(small, report, tried=search.tried, **scores)
 
 

@@ -197,7 +197,7 @@ def _simplify_one(
     searched = has_target(options)
     if not job.is_one_of_many and report.stages:
         seconds = (f"{stage.stage}{TIE}{stage.seconds:.2f}" for stage in report.stages)
-        of_what = " of the chosen try" if searched else ""
+        of_what = " of all tries" if searched else ""
         notes.insert(0, f"Seconds{of_what}: {', '.join(seconds)}.")
     if memory is None and options.memory is not None and _rows_of(options.input) is None:
         notes.append("In one piece: --memory has an effect on binary .ply files only.")
