@@ -241,7 +241,7 @@ def test_an_unknown_kind_is_refused_before_the_work(tmp_path: Path, source: Path
         (
             "sog",
             {"memory": -1},
-            r"memory must be a whole number of bytes, at least [\d,]+; found -1",
+            r"memory must be a whole number of bytes, at least [\d,]+ \([\d.]+ MB\); found -1",
         ),
     ],
 )

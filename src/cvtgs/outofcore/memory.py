@@ -13,6 +13,7 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.ply import PlyRows
 from cvtgs.outofcore.scan import SAMPLE_ROWS
 from cvtgs.processes import pool_size
+from cvtgs.text import size_text
 
 LIBRARY_BYTES = 280_000_000 if torch.version.cuda is None else 430_000_000
 """Interpreter, torch and scipy. The CUDA build of torch takes 150 MB more of its own, and maps
@@ -73,7 +74,7 @@ def check_memory(memory: int | None, *, with_images: bool) -> None:
     least = LEAST_BYTES + (IMAGE_BYTES if with_images else 0)
     if memory is not None and whole_number(memory) < least:
         raise InvalidArgumentError(
-            f"memory must be a whole number of bytes, at least {least:,}"
+            f"memory must be a whole number of bytes, at least {least:,} ({size_text(least)})"
             f"{' with images of the scene' * with_images}; found {memory!r}."
         )
 
