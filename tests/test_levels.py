@@ -73,6 +73,30 @@ def test_errors_are_weighted_by_the_mass_as_seen_from_the_middle():
     assert level.geometric_error != pytest.approx(float(errors[1]), rel=1e-2)
 
 
+@pytest.mark.slow
+def test_errors_are_those_of_the_refined_level():
+    scene = random_scene(300)
+    refined = {"steps": 5, "size": 32, "heldout": 2}
+    config = cvtgs.SimplifyConfig.from_mapping({"refine": refined})
+    (level,) = Simplifier(None, config=config, device="cpu").levels(scene, [0.1])
+    assert level.report.refinement.changed_count > 0
+    analysis, rows = analyze(scene, config), level.assignment.long()
+    squares = (scene.means - level.scene.means[rows.clamp_min(0)]).square().sum(dim=1)
+    masses = (analysis.apparent_areas * analysis.opacities).where(rows >= 0, 0.0)
+    wanted = float(((masses * squares).sum() / masses.sum()).sqrt())
+    assert level.geometric_error == pytest.approx(wanted, rel=1e-5)
+
+
+def test_a_wrong_name_of_axes_leaves_the_index_alone(scene, simplifier, tmp_path):
+    levels = simplifier.levels(scene, RHOS)
+    write_levels(levels, tmp_path, rhos=RHOS, source="a")
+    before = (tmp_path / "levels.json").read_bytes()
+    for axes in ("", "xyz"):
+        with pytest.raises(InvalidArgumentError, match="axes must be the directions of x, y"):
+            write_levels(levels, tmp_path, rhos=RHOS, source="a", axes=axes, overwrite=True)
+    assert (tmp_path / "levels.json").read_bytes() == before
+
+
 def test_invalid_rows_are_counted_once_in_every_report(simplifier):
     scene = random_scene(200)
     means = scene.means.clone()

@@ -163,7 +163,7 @@ def write_levels(
     check_one_scene(level.report.input_count for level in levels)
     check_path(source)
     check_path(folder)
-    checked_axes(axes or SCENE_AXES)
+    checked_axes(SCENE_AXES if axes is None else axes)
     ratios = written_ratios(rhos)
     if len(ratios) != len(levels):
         raise InvalidArgumentError(

@@ -76,6 +76,7 @@ def linear_view(
 
 
 @checked
+@torch.no_grad()
 def fit_colors(
     small: GaussianScene, views: ObservedViews, *, config: MatchConfig, frozen: int = 0
 ) -> GaussianScene:
@@ -309,6 +310,7 @@ def match_views(
     return Matched(colored, report)
 
 
+@torch.no_grad()
 def match_opacities(
     small: GaussianScene,
     cameras: Cameras,

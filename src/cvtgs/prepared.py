@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cvtgs.analysis import SceneAnalysis, analyze, drop_unused_bands, restore_columns
 from cvtgs.analysis.analyze import measure_contributions
-from cvtgs.analysis.effects import drop_mip_tag, select_columns
+from cvtgs.analysis.effects import restore_comments, select_columns
 from cvtgs.boxes import MaskLike, check_room, checked_mask
 from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock
@@ -160,7 +160,9 @@ class Prepared:
         kept = keep if checked.is_valid is None else keep[checked.is_valid]
         check_room(int(kept.sum()), target=target, total=len(valid))
         first, rest = kept.nonzero()[:, 0], (~kept).nonzero()[:, 0]
-        protected = with_finite_opacities(valid.select(first))
+        protected = restore_comments(
+            with_finite_opacities(valid.select(first)), valid, analysis.plan
+        )
         part, room = analysis.select(rest), target - len(protected)
         others = self._reduce(valid.select(rest), part, room, clock, kept=protected)
         reduced = others._replace(
@@ -207,10 +209,11 @@ class Prepared:
             checked, analysis = self._analyze(target, clock)
             valid = checked.scene
             reduced = self._reduce(valid, analysis, target, clock)
-            error, assignment = level_facts(valid, analysis, reduced, is_valid=checked.is_valid)
             matched = self._match(reduced, analysis, clock)
             result = self._result(matched, checked, analysis, target, clock)
-            found[target] = Level(*result, error, assignment)
+            final = reduced._replace(scene=result.scene.to(valid.device))
+            facts = level_facts(valid, analysis, final, is_valid=checked.is_valid)
+            found[target] = Level(*result, *facts)
         return found
 
     def _analyze(self, target: int, clock: StageClock) -> tuple[CheckedScene, SceneAnalysis]:
@@ -377,9 +380,8 @@ class Prepared:
         from cvtgs.refinement.refine import join_reports  # noqa: PLC0415 (most never need it)
 
         choices, plan, kept = self._config.effects, analysis.plan, result.report.kept_count
-        reduce_bands = drop_mip_tag if kept else drop_unused_bands
         small, full = (
-            reduce_bands(select_columns(scene, choices), plan)
+            drop_unused_bands(select_columns(scene, choices), plan)
             for scene in (result.scene, self._scene)
         )
         refined = refine(
@@ -393,5 +395,6 @@ class Prepared:
             observed=analysis.observed if self._config.shares_images else None,
             listener=self._listener,
         )
-        restored = restore_columns(refined.scene, self._scene, plan)
-        return Simplified(restored, join_reports(result.report, refined))
+        scene = restore_columns(refined.scene, self._scene, plan)
+        scene = concatenate([result.scene[:kept], scene[kept:]]) if kept else scene
+        return Simplified(scene, join_reports(result.report, refined))

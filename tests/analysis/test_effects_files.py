@@ -1,5 +1,6 @@
 """Effects on the command line, and parts of files that are not read."""
 
+from dataclasses import replace
 from importlib import import_module
 
 import pytest
@@ -169,6 +170,20 @@ def test_surfels_are_written_without_a_third_scale(tmp_path):
     again = cvtgs.load(tmp_path / "small.ply")
     assert again.layout == scene.layout
     assert bool((again.log_scales[:, 2] == FLAT_LOG_SCALE).all())
+
+
+@pytest.mark.parametrize("flat", ["auto", "off"])
+def test_protected_surfels_of_a_file_with_three_scales_stay_as_they_are(flat):
+    """Only the tag says that they are flat; it is lost if the others become thick."""
+    scene = replace(GaussianScene(**surfels(400).tensors()), comments=("SplatRenderMode: 2dgs",))
+    config = SimplifyConfig.from_mapping({"effects": {"flat": flat}})
+    small = Simplifier(config=config, device="cpu").simplify(
+        scene, 0.1, keep=torch.arange(400) < 20
+    )
+    assert same_bits(replace(small[:20], comments=scene.comments), scene[:20])
+    assert small.comments == (scene.comments if flat == "auto" else ())
+    is_flat = small.log_scales[20:, 2] == FLAT_LOG_SCALE
+    assert bool(is_flat.all()) == (flat == "auto")
 
 
 def test_flat_gaussians_of_a_file_with_three_scales_may_become_thick():

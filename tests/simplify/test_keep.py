@@ -105,6 +105,23 @@ def test_refinement_leaves_kept_rows_alone(scene):
     assert same_bits(small.select(torch.arange(30)), scene.select(keep))
 
 
+@pytest.mark.slow
+def test_refinement_leaves_unused_bands_at_zero():
+    """Those of protected Gaussians, which are too faint to count, stay bit for bit."""
+    scene = random_scene(400, degree=2)
+    bands = scene.shN.clone()
+    bands[:, 3:] *= 1e-7
+    scene = scene.with_tensors({"shN": bands}, {})
+    config = SimplifyConfig.from_mapping({"refine": {"steps": 4, "size": 32, "heldout": 2}})
+    small, report = Simplifier(config=config, device="cpu").run(
+        scene, 0.2, keep=torch.arange(400) < 30
+    )
+    assert report.plan.sh.degree == 1
+    assert report.refinement.changed_count > 0
+    assert same_bits(small[:30], scene[:30])
+    assert not bool(small.shN[30:, 3:].any())
+
+
 @pytest.mark.parametrize("stride", [1, 2])
 def test_refinement_is_told_what_to_keep_and_reuses_only_images_of_its_kind(
     scene, monkeypatch, stride

@@ -365,7 +365,7 @@ def restore_columns(small: GaussianScene, scene: GaussianScene, plan: EffectPlan
         >>> restore_columns(select_columns(scene, EffectsConfig(sh=0)), scene, plan).sh_degree
         3
     """
-    changes, comments = {}, scene.comments
+    changes = {}
     missing = scene.shN.shape[1] - small.shN.shape[1]
     if missing > 0:
         changes["shN"] = torch.nn.functional.pad(small.shN, (0, 0, 0, missing))
@@ -373,8 +373,12 @@ def restore_columns(small: GaussianScene, scene: GaussianScene, plan: EffectPlan
         flat = small.log_scales.clone()
         flat[:, 2].clamp_(max=FLAT_LOG_SCALE)
         changes["log_scales"] = flat
-    else:
-        comments = TWO_SCALES.removed_from(comments)
     if changes:
         small = small.with_tensors(changes)
+    return restore_comments(small, scene, plan)
+
+
+def restore_comments(small: GaussianScene, scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
+    """Restore the comments of the input, without the tag 2dgs if the plan makes flat ones thick."""
+    comments = scene.comments if plan.flat.active else TWO_SCALES.removed_from(scene.comments)
     return small if small.comments == comments else replace(small, comments=comments)

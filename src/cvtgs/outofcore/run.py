@@ -173,7 +173,11 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         range_rows=range_rows,
         sample_rows=sample_rows(room),
         cell_room=min(cell_room(memory), most_cells(target, rows.count, allocation)),
-        axes=checked_axes(output_axes or SCENE_AXES) if is_plain_ply(output) else SCENE_AXES,
+        axes=(
+            SCENE_AXES
+            if output_axes is None or not is_plain_ply(output)
+            else checked_axes(output_axes)
+        ),
         cameras=cameras if simplifier.config.uses_images else None,
     )
     if blocks is None:
