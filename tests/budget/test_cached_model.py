@@ -108,6 +108,17 @@ def test_without_a_writable_cache_the_model_is_still_measured(model, tmp_path):
     assert blocked.read_text() == "no folder"
 
 
+def test_a_measurement_that_is_saved_replaces_one_that_was_not(model, tmp_path):
+    blocked = tmp_path / "cache"
+    blocked.write_text("no folder")
+    with pytest.warns(UserWarning, match="is not saved"):
+        cost_model("cpu", calibration=lambda: model, folder=blocked)
+    blocked.unlink()
+    other = CostModel(rates={name: {names[0]: 2.0} for name, names in FEATURES.items()})
+    cost_model("cpu", recalibrate=True, calibration=lambda: other, folder=blocked)
+    assert cost_model("cpu", calibration=lambda: model, folder=blocked) == other
+
+
 def test_the_cache_folder_follows_the_environment(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache_folder() == tmp_path / "cvtgs"

@@ -253,6 +253,15 @@ def test_invalid_goals_are_refused(full, goal, text):
     assert str(caught.value) == text
 
 
+def test_no_count_above_nine_tenths_of_the_valid_gaussians_is_tried(full, views, simplifier):
+    means = full.means.clone()
+    means[::2] = torch.nan
+    with pytest.warns(DroppedDataWarning), pytest.raises(GoalError, match=" with 270 of 600 "):
+        find_count(
+            full.with_tensors({"means": means}), psnr=60.0, simplifier=simplifier, heldout=views
+        )
+
+
 def test_invalid_rows_are_warned_about_once(full, views, simplifier):
     means = full.means.clone()
     means[:3] = torch.nan

@@ -148,6 +148,12 @@ def test_a_cheaper_setting_allows_a_better_preset(model):
         choose_preset(work, budget, settings={"refine.steps": "-1"}, model=model)
 
 
+def test_settings_that_need_images_do_not_fit_without_them(model):
+    work, settings = Work(count=1000, target=10), {"visibility.views": "8"}
+    with pytest.raises(InvalidArgumentError, match="with_images must be true where the settings"):
+        choose_preset(work, 100.0, settings=settings, model=model, with_images=False)
+
+
 def high_steps() -> int:
     return preset("high").refine.steps
 

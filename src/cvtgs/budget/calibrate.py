@@ -183,6 +183,7 @@ def cost_model(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, record.to_json().encode(), overwrite=True)
+        _UNSAVED.pop(path, None)
     except (OSError, OutputError) as error:
         _UNSAVED[path] = record
         warn(f"the measurement of this machine is not saved, the next process repeats it: {error}")

@@ -20,6 +20,7 @@ from cvtgs.report import SearchReport, Simplified, SimplifyReport, Tried
 from cvtgs.scene import GaussianScene, SceneLike
 from cvtgs.simplifier import Simplifier
 from cvtgs.text import shown
+from cvtgs.validity import valid_rows
 from cvtgs.views import automatic_views
 
 STAGE = "search"
@@ -141,8 +142,8 @@ def find_count(
         The scene, and all counts that were tried.
 
     Raises:
-        GoalError: Even nine tenths of the Gaussians do not reach it; the message names the best
-            result.
+        GoalError: Even nine tenths of the valid Gaussians do not reach it; the message names the
+            best result.
         InvalidArgumentError: Both or neither are given, one is out of range, ``heldout`` is empty,
             or an argument has another type.
         InvalidSceneError: The scene has no valid row.
@@ -184,7 +185,7 @@ def find_count(
             best = made, tried[-1]
         return value
 
-    most = max(1, math.floor(MOST_SHARE * total))
+    most = max(1, math.floor(MOST_SHARE * int(valid_rows(full).sum())))
     tries = islice(smallest_enough(reach, target.value, most=most), MOST_TRIES)
     listener(ProgressEvent(stage=STAGE, done=0, total=MOST_TRIES))
     for number, (count, value) in enumerate(tries, start=1):
@@ -359,6 +360,11 @@ def choose_preset(
         for name, config in configs.items()
         if with_images or not config.uses_images
     }
+    if not costs:
+        raise InvalidArgumentError(
+            "with_images must be true where the settings make every preset render images, found "
+            "false."
+        )
     fitting = [name for name, cost in costs.items() if MARGIN * cost <= seconds]
     if not fitting:
         fastest = min(costs, key=lambda name: costs[name])
