@@ -209,7 +209,9 @@ def test_reports_of_refined_blocks_are_joined(other: str, stopped: str) -> None:
 
 def test_images_raise_the_least_memory(source, tmp_path):
     least = LEAST_BYTES + IMAGE_BYTES
-    with pytest.raises(InvalidArgumentError, match=f"at least {least:,} with images"):
+    with pytest.raises(
+        InvalidArgumentError, match=rf"at least {least:,} \([\d.]+ MB\) with images"
+    ):
         in_blocks(source, tmp_path / "no.ply", MATCHED, blocks=None, memory=least - 1)
 
 

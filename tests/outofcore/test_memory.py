@@ -226,7 +226,7 @@ def test_blocks_need_the_least_memory(tmp_path: Path) -> None:
     cvtgs.save(cvtgs.synthetic.scene("object", 200, sh_degree=0), tmp_path / "a.ply")
     for wrong in (100_000_000, 5e8, "1GB"):
         with pytest.raises(
-            InvalidArgumentError, match=f"number of bytes, at least {LEAST_BYTES:,}; f"
+            InvalidArgumentError, match=rf"number of bytes, at least {LEAST_BYTES:,} \("
         ):
             simplify_file(tmp_path / "a.ply", tmp_path / "b.ply", 0.1, memory=wrong, blocks=2)
 

@@ -106,8 +106,8 @@ def write_stream(
     place = Path(folder)
     hidden = hidden_path(place, "stream")
     shutil.rmtree(hidden, ignore_errors=True)
-    make_folder(hidden)
     try:
+        make_folder(hidden)
         part = form.write_part(plan, hidden, part=0, listener=listener)
         write_index(form, [part], hidden)
         warn_of_losses([part], place)
@@ -183,7 +183,8 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
 def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
     """Move the files of a finished stream to the output folder, the index last.
 
-    Files of the stream that it replaces are set aside, and moved back if this fails. A folder that
+    Files of the stream that it replaces are set aside, its index first, so that no index ever names
+    files of another stream. They are moved back if this fails or is interrupted. A folder that
     exists is kept, since it has permissions and may be the current one of a shell. Hidden files are
     not published: only resumed runs need them.
     """
@@ -199,8 +200,8 @@ def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
         raise _refused(place, error) from error
     found = {path.name for path in hidden.iterdir()}
     names = sorted(name for name in found if name != index and not name.startswith("."))
-    old = sorted({*names, *_names_of(place / index)})
-    aside, moved = hidden / ".replaced", list[tuple[Path, Path]]()
+    old = [index, *sorted({*names, *_names_of(place / index)})]
+    aside = hidden / ".replaced"
     moves = [(place / name, aside / name) for name in old if os.path.lexists(place / name)]
     moves += [(hidden / name, place / name) for name in (*names, index)]
     try:
@@ -208,11 +209,11 @@ def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
         aside.mkdir()
         for source, goal in moves:
             replace_file(source, goal)
-            moved.append((source, goal))
     except BaseException as error:
-        for source, goal in reversed(moved) if (hidden / index).exists() else ():
-            with suppress(OSError):
-                replace_file(goal, source)  # a resumed run needs it there
+        for source, goal in reversed(moves) if (hidden / index).exists() else ():
+            if not os.path.lexists(source):  # it was moved, even if an interrupt came right after
+                with suppress(OSError):
+                    replace_file(goal, source)  # a resumed run needs it there
         if isinstance(error, OSError):
             raise _refused(place, error) from error
         raise
