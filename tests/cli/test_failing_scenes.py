@@ -38,6 +38,26 @@ def test_names_may_be_as_long_as_the_system_allows() -> None:
     assert len(json.loads(Path("report.json").read_text())) == 3
 
 
+@pytest.mark.parametrize(
+    "words", [RUN, ("convert", ".", "-o", "out", "--suffix", ".splat")], ids=lambda words: words[0]
+)
+def test_another_run_may_remove_the_empty_folder_meanwhile(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A failed run removes a folder that it made, in which others have not written yet."""
+    read = cvtgs.io.load
+
+    def read_and_remove(*arguments: object, **options: object) -> cvtgs.GaussianScene:
+        if not list(Path("out").iterdir()):
+            Path("out").rmdir()
+        return read(*arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(cvtgs.io, "load", read_and_remove)
+    monkeypatch.setattr(cvtgs, "load", read_and_remove)
+    assert main([*words, "--quiet"]) == 0
+    assert len(written()) == 3
+
+
 def test_results_may_be_moved_away_at_once(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

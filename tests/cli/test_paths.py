@@ -53,6 +53,15 @@ def test_words_that_are_no_paths_are_usage_errors(capsys, tmp_path, monkeypatch,
     assert list(tmp_path.iterdir()) == []
 
 
+def test_paths_may_have_the_name_of_an_option(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("h").mkdir()
+    cvtgs.save(random_scene(20), "h/a.ply")
+    assert main(["convert", "h", "-o", "o"]) == 0
+    assert main(["simplify", "--rho", "0.5", "o", "-o", "small"]) == 0
+    assert len(cvtgs.load("small/a.ply")) == 10
+
+
 def test_o_may_name_the_file_of_one_scene(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     cvtgs.save(random_scene(20), "a.ply")

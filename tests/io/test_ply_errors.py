@@ -1,6 +1,7 @@
 """Error messages about damaged files and files of other kinds, word for word."""
 
 import contextlib
+import os
 import random
 import sys
 import warnings
@@ -10,8 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cvtgs.errors import DroppedDataWarning, FileFormatError, MissingDependencyError
+from cvtgs.errors import (
+    DroppedDataWarning,
+    FileFormatError,
+    InputError,
+    MissingDependencyError,
+)
 from cvtgs.io import load
+from cvtgs.io.ply import read
 from cvtgs.io.ply.header import MAX_HEADER_BYTES
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
 
@@ -300,6 +307,22 @@ def test_random_damage_is_a_scene_or_a_format_error(tmp_path: Path) -> None:
             contextlib.suppress(FileFormatError, DroppedDataWarning),
         ):
             load(path)
+
+
+def test_a_file_that_becomes_shorter_while_it_is_read_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.ply"
+    path.write_bytes(GOOD)
+    check = read.check_size
+
+    def check_and_cut(*arguments: object, **options: object) -> None:
+        check(*arguments, **options)  # type: ignore[arg-type]
+        os.truncate(path, len(GOOD) // 2)
+
+    monkeypatch.setattr(read, "check_size", check_and_cut)
+    with pytest.raises(InputError, match="must stay as it is while it is read, found it shorter"):
+        load(path)
 
 
 def test_without_plyfile_unusual_files_say_what_to_install(

@@ -23,7 +23,7 @@ from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.counts import target_count
 from cvtgs.devices import chosen_device, device_name
-from cvtgs.errors import OutputError, warn
+from cvtgs.errors import OutputError, reason_of, warn
 from cvtgs.io.atomic import write_atomically
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.scene import GaussianScene
@@ -186,7 +186,9 @@ def cost_model(
         _UNSAVED.pop(path, None)
     except (OSError, OutputError) as error:
         _UNSAVED[path] = record
-        warn(f"the measurement of this machine is not saved, the next process repeats it: {error}")
+        is_own = isinstance(error, OutputError)
+        reason = str(error) if is_own else f"{path.parent}: {reason_of(error)}"
+        warn(f"the measurement of this machine is not saved, the next process repeats it: {reason}")
     return model
 
 

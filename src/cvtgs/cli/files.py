@@ -17,6 +17,7 @@ from cvtgs.cli.jobs import (
     SceneJob,
     add_paths,
     input_file,
+    make_output_folder,
     open_jobs,
     run_jobs,
 )
@@ -365,6 +366,7 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
     unasked = [phrase for phrase in phrases if phrase.startswith((LOST_DIGITS, "the tag"))]
     if options.quiet and unasked:  # columns and what the format cannot hold have warnings already
         warn(f"{options.input}: lost {'; '.join(unasked)}.", DroppedDataWarning)
+    make_output_folder(options)
     with nullcontext() if options.quiet else without_warnings(DroppedDataWarning):
         cvtgs.io.save(
             scene,

@@ -253,8 +253,6 @@ def _size_of_output(path: Path) -> int | None:
 
 def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
     """Return a job for every input; raise if two would write the same file."""
-    from cvtgs.io.atomic import make_folder
-
     sources = expanded(options.paths)
     targets: dict[Path, Path] = {}
     named: dict[str, Path] = {}
@@ -279,8 +277,16 @@ def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
                 )
         own = argparse.Namespace(**{**vars(options), "input": source, "output": target})
         jobs.append(SceneJob(options=own, is_one_of_many=True))
-    make_folder(options.folder)
+    make_output_folder(options)
     return jobs
+
+
+def make_output_folder(options: argparse.Namespace) -> None:
+    """Make the folder of ``-o`` unless it is there; a failed run removes one that it made."""
+    from cvtgs.io.atomic import make_folder
+
+    if options.folder is not None:
+        make_folder(options.folder)
 
 
 def expanded(patterns: Iterable[str | Path]) -> list[Path]:

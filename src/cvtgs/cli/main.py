@@ -105,7 +105,7 @@ def _run(words: Sequence[str], stop: "_Stop") -> None:
         if options.command != "completion":  # needs no tensors, and starts faster without them
             with stop.held():  # an interrupted import of torch may end in its C++ code
                 load_torch()
-        with _without_empty_folder(options), _lock(options):
+        with _lock(options), _without_empty_folder(options):
             _run_command(options)
     flush_output()
 

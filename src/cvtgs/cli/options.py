@@ -217,7 +217,7 @@ class CommandParser(argparse.ArgumentParser):
                     self.error(
                         f"unrecognized argument: {name}{suggestion(name, options, likeness=0.7)}"
                     )
-                if f"-{name}" in options:  # else -output means -o utput
+                if name.startswith("-") and f"-{name}" in options:  # else -output means -o utput
                     self.error(f"unrecognized argument: {name}; did you mean -{name}?")
         known, rest = super().parse_known_args(args, namespace)
         if self.check is not None:  # allows paths between options

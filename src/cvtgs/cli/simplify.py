@@ -19,7 +19,14 @@ from cvtgs.cli.goals import (
     search_target,
     with_limited_bands,
 )
-from cvtgs.cli.jobs import Outcome, SceneJob, add_paths, open_jobs, run_jobs
+from cvtgs.cli.jobs import (
+    Outcome,
+    SceneJob,
+    add_paths,
+    make_output_folder,
+    open_jobs,
+    run_jobs,
+)
 from cvtgs.cli.options import (
     CAMERA_FILES,
     AddParser,
@@ -284,6 +291,7 @@ def _simplify_in_memory(
         )
     if chosen is not None:
         notes += chosen.late_note(report.seconds)
+    make_output_folder(options)
     cvtgs.io.save(small, options.output, overwrite=options.overwrite, axes=axes.target)
     remove_job_files(options.output)
     return report, notes

@@ -66,7 +66,7 @@ def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -
         vertex = find_vertices(header, where)
         check_size(header, vertex, path=where, size=os.fstat(file.fileno()).st_size)
         if can_map(header):
-            chunks = _mapped_chunks(file, header)
+            chunks = _mapped_chunks(file, header, where)
         else:
             rows = _parsed_rows(file, header, vertex, where)
             starts = range(0, vertex.count, _CHUNK_ROWS)
@@ -180,7 +180,13 @@ def can_map(header: Header) -> bool:
     return little and first.name == "vertex" and not first.has_lists
 
 
-def _mapped_chunks(file: BinaryIO, header: Header) -> Iterator[NDArray[Any]]:
+def _changed_while_read(path: object, error: Exception) -> InputError:
+    """Return the error for a file whose rows can no longer be mapped."""
+    found = "it shorter" if isinstance(error, ValueError) else reason_of(error)
+    return InputError(f"{path}: must stay as it is while it is read, found {found}.")
+
+
+def _mapped_chunks(file: BinaryIO, header: Header, path: str) -> Iterator[NDArray[Any]]:
     """Map the vertex rows, a megabyte at a time.
 
     Each chunk is unmapped when the caller releases it, so the file's pages do not accumulate:
@@ -192,7 +198,11 @@ def _mapped_chunks(file: BinaryIO, header: Header) -> Iterator[NDArray[Any]]:
     for start in range(0, vertex.count, rows):
         offset = header.data_offset + start * dtype.itemsize
         shape = (min(rows, vertex.count - start),)
-        yield np.memmap(file, dtype, "r", offset, shape).view(np.ndarray)
+        try:
+            mapped = np.memmap(file, dtype, "r", offset, shape)
+        except (OSError, ValueError) as error:
+            raise _changed_while_read(path, error) from error
+        yield mapped.view(np.ndarray)
 
 
 def _parsed_rows(file: BinaryIO, header: Header, vertex: Element, path: str) -> NDArray[Any]:
@@ -309,10 +319,7 @@ class PlyRows:
         try:
             mapped = np.memmap(self.path, self.dtype, "r", place, (stop - start,))
         except (OSError, ValueError) as error:
-            found = "it shorter" if isinstance(error, ValueError) else reason_of(error)
-            raise InputError(
-                f"{self.path}: must stay as it is while it is read, found {found}."
-            ) from error
+            raise _changed_while_read(self.path, error) from error
         return mapped.view(np.ndarray)
 
     def scene(self, rows: NDArray[Any]) -> GaussianScene:
