@@ -263,11 +263,13 @@ def predict(weights: Mapping[str, Array], cell: Cell) -> dict[str, Array]:
         shift += gate[0] * position / len(of_pairs)
         turn += 2.0 * gate[2:] * twist(position / (1.0 + np.abs(position))) / len(of_pairs)
     sizes = dense(weights, "decoder", pooled)
+    ratios = np.array([math.log(other.area / cell.own.area) for other in cell.others])
+    lends = np.clip(ratios + 4.5, 0.0, 1.0)
     return {
         "d_means": shift,
         "d_log_scales": 0.6 * np.tanh(sizes[:3]),
         "d_rotvecs": 0.5 * np.tanh(turn),
         "d_logit_opacities": 2.0 * np.tanh(0.5 * sizes[3]),
         "member_colors": shares * [gate[1] for gate in of_members],
-        "pair_colors": np.array([gate[1] for gate in of_pairs]) / max(1, len(of_pairs)),
+        "pair_colors": lends * [gate[1] for gate in of_pairs] / max(1, len(of_pairs)),
     }

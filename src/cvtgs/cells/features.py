@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cells.descriptors import LEAST_PIXELS, PIXEL_SCALE, Descriptors
+from cvtgs.cells.descriptors import AREA_SCALE, LEAST_PIXELS, PIXEL_SCALE, Descriptors
 from cvtgs.cells.inflate import project_on_axes, side_cover
 from cvtgs.cells.partition import Partition, SampledMembers, sample_members
 from cvtgs.checks import checked
@@ -166,7 +166,7 @@ def neighbor_context(
         uncovered.sum(dim=1),
         _distance(back),
         other.opacities,
-        0.2 * relative.log_areas,
+        AREA_SCALE * relative.log_areas,
         0.2 * torch.log(crowding),
         3 * relative.contrasts,
         other.opacities * _density(back),
@@ -220,7 +220,7 @@ def describe_members(
         uncovered.sum(dim=1),
         0.3 * parameters.positive_log(weights * sampled.rates * counts).clamp(-14, 14),
         members.opacities,
-        0.2 * relative.log_areas,
+        AREA_SCALE * relative.log_areas,
         3 * relative.contrasts,
         0.5 * relative.contrasts / (contrasts + 0.02),
         visible,

@@ -14,6 +14,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from cvtgs.cells.descriptors import (
+    AREA,
+    AREA_SCALE,
     CELL_FEATURES,
     LEAST_PIXELS,
     MEMBER_FEATURES,
@@ -35,6 +37,10 @@ LARGEST_TURN = 0.5  # largest rotation of a cell about each of its axes, in radi
 
 LARGEST_MEMBER_GATE = 2.0
 LARGEST_PAIR_GATE = 0.5
+
+LEAST_AREA = -4.5
+"""Logarithm of the ratio of areas up to which a neighbour is too small to lend its colour; from 1
+above it, it lends all. A cell of the sky has much smaller ones far in front of it as neighbours."""
 
 SUMMARY_FEATURES = CELL_FEATURES - 1 + MEMBER_FEATURES + PAIR_FEATURES
 """Number of features that decide whether a cell is similar to the training cells."""
@@ -208,13 +214,14 @@ class MergeNet(CellNetwork):
         pixels = descriptors.cells[:, -1] / PIXEL_SCALE
         known = self.known(summarize(descriptors)) * (pixels - (LEAST_PIXELS - 1)).clamp(0, 1)
         by_cell = known[:, None]
+        lends = (descriptors.pairs[:, :, AREA] / AREA_SCALE - LEAST_AREA).clamp(0, 1)
         return Residuals(
             d_means=(pulls[:, :3] + others[:, :3]) * by_cell,
             d_log_scales=self.architecture.largest_growth * torch.tanh(sizes[:, :3]) * by_cell,
             d_rotvecs=LARGEST_TURN * torch.tanh(twists) * by_cell,
             d_logit_opacities=LARGEST_LOGIT_CHANGE * torch.tanh(0.5 * sizes[:, 3]) * known,
             member_colors=of_members[:, 1] * weights * known.index_select(0, ids),
-            pair_colors=of_pairs[:, 1].unflatten(0, shape) * by_cell,
+            pair_colors=of_pairs[:, 1].unflatten(0, shape) * by_cell * lends,
         )
 
 
