@@ -143,10 +143,14 @@ def moved_from(scene: GaussianScene, origin: Float[Tensor, "3"] | None) -> Gauss
 
 
 def moved_back(
-    small: GaussianScene, origin: Float[Tensor, "3"], scene: GaussianScene, shown: cells.Partition
+    small: GaussianScene,
+    origin: Float[Tensor, "3"],
+    scene: GaussianScene,
+    represented: cells.Partition,
 ) -> GaussianScene:
     """Move the results of cells back, those of a single member to its very position."""
-    rows, is_single = shown.order[shown.offsets[:-1]], (shown.counts == 1)[:, None]
+    rows = represented.order[represented.offsets[:-1]]
+    is_single = (represented.counts == 1)[:, None]
     return small.with_tensors(means=torch.where(is_single, scene.means[rows], small.means + origin))
 
 
@@ -240,12 +244,12 @@ def merge_and_inflate(
     Returns:
         One Gaussian per cell.
     """
-    merged, shown = merge_members(
+    merged, represented = merge_members(
         scene, partition, config, areas=areas, clamping=clamping, on_cells=on_cells
     )
     near = neighbor_count(config, with_network=with_network)
     neighbors = cvt.nearest_neighbors(merged.means, near)
-    return Merged(shape_merged(merged, shown, neighbors, config), shown, neighbors)
+    return Merged(shape_merged(merged, represented, neighbors, config), represented, neighbors)
 
 
 def merge_members(
@@ -274,17 +278,21 @@ def neighbor_count(config: MergeConfig, *, with_network: bool) -> int:
 
 def shape_merged(
     merged: GaussianScene,
-    shown: cells.Partition,
+    represented: cells.Partition,
     neighbors: Int[Tensor, "m k"],
     config: MergeConfig,
 ) -> GaussianScene:
     """Align axes and inflate; merged Gaussians beyond the partition only serve as neighbours."""
     if config.align_axes:
-        merged = cells.align_axes(merged, shown, neighbors)
+        merged = cells.align_axes(merged, represented, neighbors)
     if config.inflation == 0.0 and config.covered_inflation == 0.0:
         return merged
     return cells.inflate_cells(
-        merged, shown, neighbors, everywhere=config.inflation, covered=config.covered_inflation
+        merged,
+        represented,
+        neighbors,
+        everywhere=config.inflation,
+        covered=config.covered_inflation,
     )
 
 

@@ -318,7 +318,7 @@ def keep_representatives(
         for name, values in merged.extras.items()
     }
     kept_rows = torch.where(is_kept, representatives, -1)
-    shown = partition.keep_only(kept_rows, len(order) - members + number)
+    represented = partition.keep_only(kept_rows, len(order) - members + number)
     if partition.singles is not None:
-        shown = replace(shown, singles=partition.singles + number)
-    return merged.with_tensors(tensors, extras), shown
+        represented = replace(represented, singles=partition.singles + number)
+    return merged.with_tensors(tensors, extras), represented

@@ -62,17 +62,17 @@ def merge(job: Job, block: int) -> None:
         return
     found = read_cells(job, block)
     scene, partition, scan = found.scene, found.partition, job.read_scan()
-    merged, shown = merge_members(
+    merged, represented = merge_members(
         moved_from(scene, scan.frame.far_origin(scene.means)),
         partition,
         job.config.merge,
         areas=scene.areas,
         clamping=scan.plan.clamping.active,
     )
-    first = shown.order[shown.offsets[:-1]]
+    first = represented.order[represented.offsets[:-1]]
     more = {
-        "sizes": shown.counts,
-        "representatives": torch.where(shown.counts < partition.counts, first, -1),
+        "sizes": represented.counts,
+        "representatives": torch.where(represented.counts < partition.counts, first, -1),
         "bounds": bounding_box(merged.means),
     }
     tensors = merged.tensors() | add_prefix(EXTRA, merged.extras) | more
@@ -94,8 +94,8 @@ def inflate(job: Job, block: int) -> None:
     neighbors = cvt.nearest_neighbors(merged.means, near)[:own_count]
     # Only the number of members per cell matters here, so their rows are left out.
     offsets = torch.nn.functional.pad(own["sizes"].cumsum(0), (1, 0))
-    shown = cells.Partition(order=own["sizes"][:0], offsets=offsets)
-    inflated = shape_merged(merged, shown, neighbors, job.config.merge)
+    represented = cells.Partition(order=own["sizes"][:0], offsets=offsets)
+    inflated = shape_merged(merged, represented, neighbors, job.config.merge)
     found = {
         "quats": inflated.quats[:own_count],
         "log_scales": inflated.log_scales[:own_count],
@@ -114,7 +114,7 @@ def correct(job: Job, block: int) -> None:
     scan = job.read_scan()
     origin = scan.frame.far_origin(scene.means)
     own = job.read("inflated", block)
-    shown = partition.keep_only(own["representatives"])
+    represented = partition.keep_only(own["representatives"])
     small, sizes = _with_halo(job, "inflated", block, own["remote"])
     net = job.read_network(scene.dtype)
     if net is not None:
@@ -122,7 +122,7 @@ def correct(job: Job, block: int) -> None:
             net,
             moved_from(scene, origin),
             small,
-            shown,
+            represented,
             neighbors=own["neighbors"],
             visibility=visibility,
             pixel_size=scan.frame.view_radius / job.config.merge.image_size,
@@ -131,14 +131,14 @@ def correct(job: Job, block: int) -> None:
     tensors = {name: values[: len(own["sizes"])] for name, values in small.tensors().items()}
     small = scene.with_tensors(tensors, under_prefix(EXTRA, own))
     if origin is not None:
-        small = moved_back(small, origin, original, shown)
+        small = moved_back(small, origin, original, represented)
     is_whole = job.read_manifest().total == scan.row_count
     finish = validity.with_finite_opacities if is_whole else validity.standardized
     small = restore_columns(finish(small), original, scan.plan)
     report = BlockReport(
         input_count=len(scene),
         mass_out=float(small.masses.sum()),
-        single_member_cells=shown.count_singles(),
+        single_member_cells=represented.count_singles(),
         largest_cell=int(partition.counts.amax()),
         backend=search_name(scene.device),
     )
