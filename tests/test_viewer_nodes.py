@@ -20,6 +20,13 @@ def scene() -> GaussianScene:
     return random_scene(500, degree=1, size=0.05)
 
 
+def test_scenes_may_require_gradients(scene: GaussianScene) -> None:
+    tensors = {name: x.clone().requires_grad_() for name, x in scene.tensors().items()}
+    server, node = node_of("a")
+    node.draw(scene.with_tensors(tensors), visible=True)
+    assert list(server.scene.nodes) == ["/scene 0"]
+
+
 @pytest.mark.slow
 def test_a_standalone_page_starts_in_view_of_the_scene(scene: GaussianScene) -> None:
     assert scene_page({"a": scene, "b": random_scene(7)}) == "<html>[[500], [7]] True</html>"

@@ -45,7 +45,9 @@ def test_blind_views_do_not_count_in_means(scene, small, blind):
     (alone,) = evaluate(scene, {"small": small}, good, settings=SETTINGS).scenes
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        (found,) = evaluate(scene, {"small": small}, both, settings=SETTINGS).scenes
+        evaluation = evaluate(scene, {"small": small}, both, settings=SETTINGS)
+    assert evaluation.blind == tuple(range(blind))
+    (found,) = evaluation.scenes
     texts = [str(one.message) for one in caught]
     assert texts == ([f"{blind} of {4 + blind} views show nothing of full, so they do not count in "
                       f"mean scores."] if blind else [])  # fmt: skip

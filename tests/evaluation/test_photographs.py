@@ -51,6 +51,27 @@ def test_grey_of_16_bits_is_that_of_8(suffix, tmp_path):
             assert (found[:, :, channel] * 255).round().byte().numpy().tolist() == values.tolist()
 
 
+@pytest.mark.parametrize("name", ["a.jpg", "a.JPG", "a.jpeg", "images/a.Jpeg"])
+def test_a_mask_of_another_format_is_no_photograph(tmp_path, name):
+    for suffix, value in ((".png", 0), (".jpg", 255)):
+        content = encode(np.full((36, 48, 3), value, np.uint8), "png")
+        (tmp_path / f"a{suffix}").write_bytes(content)
+    assert float(load_photographs(tmp_path, rig_of(name)).mean()) == 1.0
+
+
+def test_two_formats_of_which_none_is_that_of_the_name_are_an_error(tmp_path):
+    content = encode(np.zeros((36, 48, 3), np.uint8), "png")
+    (tmp_path / "a.png").write_bytes(content)
+    for name in ("a", "a.HEIC", "a.tif"):
+        assert load_photographs(tmp_path, rig_of(name)).shape == (1, 36, 48, 3)
+    (tmp_path / "a.jpg").write_bytes(content)
+    for name in ("a", "a.HEIC", "a.tif"):
+        with pytest.raises(InvalidArgumentError) as caught:
+            load_photographs(tmp_path, rig_of(name))
+        wanted = f"{tmp_path}: must hold one photograph of camera {name!r}, found a.png and a.jpg."
+        assert str(caught.value) == wanted
+
+
 def test_a_suffix_may_start_with_a_capital(tmp_path):
     one = cvtgs.Cameras(
         viewmats=torch.eye(4)[None], Ks=torch.eye(3)[None], width=8, height=8, names=("a.jpg",)

@@ -210,6 +210,18 @@ def test_a_distance_that_is_no_number_from_0_is_refused(radii: Any, tmp_path: Pa
         stream_file("none.ply", tmp_path, [0.5], kind="sog", environment_radii=radii)
 
 
+def test_the_environment_begins_at_radii_of_the_full_scene() -> None:
+    """Of 100 Gaussians, four far ones are a third of the small scene, and stretch its own frame."""
+    places = [0.01 * number for number in range(96)] + [60.0, 70.0, 80.0, 90.0]
+    fine_places = [0.1, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, *places[96:]]
+    owners = [number // 12 for number in range(96)] + [8, 9, 10, 11]
+    fine = level(fine_places, owners)
+    coarse = level([0.5, *places[96:]], [0] * 96 + [1, 2, 3, 4])
+    plan = plan_stream([fine, coarse], environment_radii=20.0)
+    assert plan.environment is not None
+    assert [len(rows) for rows in plan.far] == [4, 4]
+
+
 def test_the_nearest_gaussian_is_never_in_the_environment() -> None:
     scene = random_scene(20)
     frame = robust_frame(scene.means)

@@ -3,8 +3,10 @@
 import pytest
 import torch
 
+from camera_files import transforms, write_json
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation.scorer import ViewImages
 from cvtgs.math.frames import robust_frame
 from cvtgs.mergenet import correct_cells
@@ -231,3 +233,12 @@ def test_distances_of_random_views():
     distances = torch.linalg.vector_norm(steps, dim=1)
     assert 0.2 - 1e-4 <= float(distances.amin()) < 0.5
     assert 1.2 < float(distances.amax()) < 1.5  # some are raised above the ground
+
+
+def test_cameras_that_see_nothing_do_not_validate(tmp_path):
+    """All gains would be zero, and the untrained network the best."""
+    scene, file = small_scene(100), tmp_path / "exam.transforms.json"
+    write_json(file, transforms())
+    away = scene.with_tensors({"means": scene.means + 1e5}, {})
+    with pytest.raises(InvalidArgumentError, match=r"the cameras must see the scene beside .*exam"):
+        render_targets(away, 2, size=32, seed=0, file=file)

@@ -316,3 +316,12 @@ def test_without_matplotlib_there_is_a_network_and_no_image(scenes, cache, tmp_p
     run(config_of(scenes), tmp_path / "net.safetensors", cache, overwrite=True)
     assert (tmp_path / "net.safetensors").is_file()
     assert not (tmp_path / "net.png").exists()
+
+
+def test_scenes_may_have_double_precision(tmp_path):
+    for number, name in enumerate(("exam", "lesson")):
+        scene = small_scene(400 + number)
+        double = {key: tensor.double() for key, tensor in scene.tensors().items()}
+        cvtgs.save(scene.with_tensors(double, {}), tmp_path / f"{name}.ply")
+    assert cvtgs.load(tmp_path / "exam.ply").dtype == torch.float64
+    run(tiny_config(tiny_data(tmp_path)), tmp_path / "net.safetensors")

@@ -361,6 +361,7 @@ def _score_images(
         reference=reference_name,
         reference_count=len(reference),
         views=tuple(map(printable_name, cameras.view_names)),  # JSON is UTF-8
+        blind=tuple(blind),
         width=cameras.width,
         height=cameras.height,
         backend=choose_backend(settings.backend, reference.device)[0],

@@ -23,6 +23,7 @@ from cvtgs.errors import (
     reason_of,
 )
 from cvtgs.io.files import is_folder
+from cvtgs.text import shown
 
 Encoding = Literal["png", "webp"]
 
@@ -61,6 +62,7 @@ _ALPHA = (
 
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+_OTHER_SUFFIXES = (".avif", ".dng", ".exr", ".gif", ".heic", ".heif")  # of cameras' originals
 
 
 def _css_gradient(colors: tuple[tuple[int, int, int], ...]) -> str:
@@ -298,17 +300,35 @@ def _find_all(place: Path, cameras: Cameras) -> list[Path]:
 
 
 def _find(folder: Path, name: str) -> Path | None:
-    """Look for the whole name, then for fewer of its last parts; each as it is, then by suffix."""
+    """Look for the whole name, then for fewer of its last parts; each as it is, then by suffix.
+
+    A suffix of the same format comes first. If there are several others, one may be a mask.
+    """
     whole = PurePosixPath(name.replace("\\", "/"))
     parts = [part for part in whole.parts if part not in ("/", ".", "..")]
     for first in range(len(parts)):
         exact = folder.joinpath(*parts[first:])
         if exact.suffix.lower() in SUFFIXES and exact.is_file():
             return exact
-        base = exact.with_suffix("") if exact.suffix.lower() in SUFFIXES else exact
+        own = _format_of(exact.suffix)
+        has_suffix = own in (*map(_format_of, SUFFIXES), *_OTHER_SUFFIXES)
+        base = exact.with_suffix("") if has_suffix else exact
+        found: dict[str, Path] = {}
         for suffix in SUFFIXES:
             for written in (suffix, suffix.upper(), suffix.title()):
                 candidate = base.with_name(base.name + written)
                 if candidate.is_file():
-                    return candidate
+                    found.setdefault(_format_of(suffix), candidate)
+        if len(found) > 1 and own not in found:
+            names = " and ".join(path.name for path in found.values())
+            raise InvalidArgumentError(
+                f"{folder}: must hold one photograph of camera {shown(name)}, found {names}."
+            )
+        if found:
+            return found.get(own) or next(iter(found.values()))
     return None
+
+
+def _format_of(suffix: str) -> str:
+    """Return the usual suffix of an image format."""
+    return {".jpeg": ".jpg", ".tiff": ".tif"}.get(suffix.lower(), suffix.lower())

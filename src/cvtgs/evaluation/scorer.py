@@ -36,6 +36,7 @@ class Score(Record):
 
     Attributes:
         mean: Mean over the views; over those that show something of the full scene, if any does.
+            Against photographs, all count.
         views: The value of each view.
     """
 
@@ -104,6 +105,8 @@ class Evaluation(Record):
         reference: Name of the full scene.
         reference_count: Number of its Gaussians.
         views: Names of the views.
+        blind: Numbers of the views that show nothing of the full scene, which do not count in
+            means of scores against its images.
         width: Width of the images, pixels.
         height: Height of the images, pixels.
         backend: Name of the backend that rendered.
@@ -117,6 +120,7 @@ class Evaluation(Record):
     reference: str
     reference_count: int
     views: tuple[str, ...]
+    blind: tuple[int, ...] = ()
     width: int
     height: int
     backend: str

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from jaxtyping import Int
 from torch import Tensor
 
-from cvtgs.analysis.effects import select_columns
+from cvtgs.analysis.effects import restore_comments, select_columns
 from cvtgs.checks import checked
 from cvtgs.clock import StageClock
 from cvtgs.counts import checked_whole, shared_out, target_count, written_ratios
@@ -350,7 +350,8 @@ def write_block(spec: StreamJob, block: int) -> None:
     clock = StageClock(silent, scene.device)
     for target in targets:
         if target >= len(scene):
-            levels.append(BlockLevel(with_finite_opacities(scene), 0.0, None))
+            whole = restore_comments(with_finite_opacities(scene), scene, analysis.plan)
+            levels.append(BlockLevel(whole, 0.0, None))
             continue
         reduced = reduce_scene(scene, analysis, target, job.config, net=net, clock=clock)
         levels.append(BlockLevel(reduced.scene, *level_facts(scene, analysis, reduced)))

@@ -174,7 +174,11 @@ def plan_stream(
             f"a stream needs levels of different sizes, found levels of {counts}; other ratios "
             f"help a small scene."
         )
-    near = near_rows(ordered[-1].scene, robust_frame(ordered[0].scene.means), environment_radii)
+    # Every Gaussian of the full scene counts, at the place of the one that replaces it: a small
+    # scene has a larger share of far ones.
+    rows = _assignment(ordered[0])
+    frame = robust_frame(ordered[0].scene.means.to(rows.device)[rows[rows >= 0]])
+    near = near_rows(ordered[-1].scene, frame, environment_radii)
     return plan_part(ordered, near, chunk_gaussians=chunk_gaussians)
 
 

@@ -16,6 +16,7 @@ from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import target_count
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.evaluation.blind_views import check_seen
 from cvtgs.evaluation.scorer import ViewImages, render_views
 from cvtgs.io import load_cameras
 from cvtgs.mergenet import MergeNet, Net, Residuals, compose
@@ -228,4 +229,5 @@ def render_targets(
         cameras = mixed_views(scene, count, size=size, seed=seed, sharp=False)
     else:
         cameras = load_cameras(file).spread(count).fitted(size)
+        check_seen(scene, cameras, name=f"the scene beside {file}")
     return render_views(scene, cameras.in_both_modes()).to("cpu").half()

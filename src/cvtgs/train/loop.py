@@ -27,6 +27,7 @@ from cvtgs.errors import (
     OutputExistsError,
     TrainingError,
     warn,
+    without_warnings,
 )
 from cvtgs.evaluation.scorer import ViewImages
 from cvtgs.io.atomic import check_output, make_folder, write_atomically
@@ -247,7 +248,8 @@ def _compute(config: TrainConfig, cache: Path, net: Net, step: int, number: int)
 
 @lru_cache(maxsize=1)
 def _training_cases(config: TrainConfig, cache: Path) -> list[CaseWithViews]:
-    sources = find_sources(config.data, seed=config.seed)
+    with without_warnings(UserWarning):  # the process that started this one has warned
+        sources = find_sources(config.data, seed=config.seed)
     scenes = [prepare_scene(one, config, cache) for one in sources if not one.is_validation]
     return [(case, scene.views) for scene in scenes for case in scene.cases]
 

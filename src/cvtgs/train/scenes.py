@@ -165,7 +165,9 @@ def _digest(path: Path) -> str:
 
 
 def _load_valid(path: Path) -> GaussianScene:
-    return valid_part(load(path))
+    """Read the valid rows of a scene, in the precision of networks that are trained."""
+    scene = valid_part(load(path))
+    return scene.with_tensors({name: x.float() for name, x in scene.tensors().items()})
 
 
 def _block_of(source: Source, count: int, seed: int) -> GaussianScene:

@@ -108,6 +108,7 @@ class SceneNode:
     def draw(self, scene: GaussianScene, *, visible: bool) -> None:
         """Draw a scene in place of the current one."""
         part = valid_part(scene).to("cpu")
+        part = part.with_tensors({name: x.detach() for name, x in part.tensors().items()})
         covariances = build_covariances(part.scales, normalize_quats(part.quats))
         arrays = {
             "centers": part.means.float().numpy(),
@@ -206,7 +207,7 @@ class ViewerServer:
         presets = tuple(PRESETS)
         self._preset = gui.add_dropdown("preset", presets, initial_value=preset)
         self._shown = gui.add_dropdown(
-            "show", (SIMPLIFIED, *viewer.scenes), initial_value=SIMPLIFIED
+            "show", tuple(dict.fromkeys((SIMPLIFIED, *viewer.scenes))), initial_value=SIMPLIFIED
         )
         score = gui.add_button("PSNR of this view")
         self._path = gui.add_text("file", "small.ply")
