@@ -320,9 +320,9 @@ def watched_costs(monkeypatch, *names):
     seen = []
     costs = merge_pairs.__wrapped__.__globals__["_pair_costs"]
 
-    def noted(table, first, second, config):
+    def noted(table, first, second, config, heavy):
         seen.append(tuple(getattr(config, name) for name in names))
-        return costs(table, first, second, config)
+        return costs(table, first, second, config, heavy)
 
     monkeypatch.setitem(merge_pairs.__wrapped__.__globals__, "_pair_costs", noted)
     return seen

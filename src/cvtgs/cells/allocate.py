@@ -5,6 +5,7 @@ tessellation makes more cells than are wanted, and the cheapest pairs merge.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -37,6 +38,8 @@ COMMON_CONTRAST = 0.2
 LEAST_CONTRAST, LARGEST_CONTRAST = 0.3, 1.4
 """Limits of the contrast in weights, in units of the common one."""
 
+MOSTLY_FAR = 0.3  # share of far mass from which on the limit of heavy pairs applies in full
+
 VIEWERS = 3.0  # distance from the middle of the scene, in robust radii, from which it is often seen
 
 SAMPLE = 1 << 16
@@ -44,6 +47,16 @@ SAMPLE = 1 << 16
 
 MOST_ROUNDS = 30  # number of vectorised rounds that choose disjoint pairs; captures need 6 to 11
 ROW_BITS, LAST_ROW = 32, (1 << 32) - 1  # keys to sort by have a row number in their lower bits
+
+
+class Heavy(NamedTuple):
+    """The apparent mass of a heavy pair, 0 for none, and the power by which its cost grows."""
+
+    mass: float = 0.0
+    power: float = 0.0
+
+
+NEVER = Heavy()
 
 
 @checked
@@ -56,7 +69,8 @@ def merge_pairs(
     Gaussian, plus the squared colour distance, times a power of the mass as seen in images, times
     the number of Gaussians, which keeps groups balanced. The contrast of neighbouring groups
     scales the power and the weight of colour; far mass lowers the power. Pairs that would be seen
-    at a wide angle cost more. Where no neighbours are left to merge, groups of adjacent rows do.
+    at a wide angle cost more, and so do heavy ones where much mass is far. Where no neighbours are
+    left to merge, groups of adjacent rows do.
 
     Args:
         groups: Moments of the groups.
@@ -81,13 +95,16 @@ def merge_pairs(
     """
     count = checked_whole(count, "count", most=len(groups.masses), things="groups")
     contrast = _relative_contrast(groups.colors, neighbors)
-    far = float(far_share(torch.linalg.vector_norm(groups.means, dim=0), groups.apparent_masses))
+    masses = groups.apparent_masses
+    share = far_share(torch.linalg.vector_norm(groups.means, dim=0), masses)
+    far, mass = torch.stack([share, masses.double().sum()]).tolist()
     update = {
         "color": config.color / contrast,
         "mass_power": config.mass_power * contrast * (1.0 - config.far_relief * far),
         "widest": config.widest if far > 0.0 else 0.0,  # a bounded scene has no sky
     }
     config = config.model_copy(update=update)
+    heavy = Heavy(config.heaviest * mass / count, min(1.0, far / MOSTLY_FAR))
     table = torch.cat([torch.atleast_2d(values).float() for values in groups])  # fast to gather
     total, device = len(groups.masses), groups.masses.device
     labels = torch.arange(total, device=device)
@@ -98,7 +115,7 @@ def merge_pairs(
             pairs = _distinct_pairs(rows[:-1], rows[1:])
         first, second = pairs >> ROW_BITS, pairs & LAST_ROW
         wanted = min(total - count, max(1, int(SHARE_PER_ROUND * total)))
-        costs = _pair_costs(table, first, second, config)
+        costs = _pair_costs(table, first, second, config, heavy)
         kept, merged = _cheapest_disjoint(first, second, costs, wanted, total)
         is_kept = torch.ones(total, dtype=torch.bool, device=device)
         is_kept[merged] = False
@@ -153,7 +170,11 @@ def _take(table: Float[Tensor, "c n"], groups: Int[Tensor, "k"]) -> Moments:
 
 
 def _pair_costs(
-    table: Float[Tensor, "c n"], first: Tensor, second: Tensor, config: AllocationConfig
+    table: Float[Tensor, "c n"],
+    first: Tensor,
+    second: Tensor,
+    config: AllocationConfig,
+    heavy: Heavy = NEVER,
 ) -> Float[Tensor, "p"]:
     """Return the cost of merging each pair, at least 0; infinite where float32 overflows."""
     volumes = _log_volume(table[6:12])  # the covariances
@@ -170,7 +191,10 @@ def _pair_costs(
         cost += config.color * share * (1.0 - share) * squares
         if config.widest:
             cost *= _fog_factor(joint, torch.lerp(two.means, one.means, share), config.widest)
-        cost *= (one.apparent_masses + two.apparent_masses) ** config.mass_power
+        mass = one.apparent_masses + two.apparent_masses
+        cost *= mass**config.mass_power
+        if heavy.mass > 0.0 and heavy.power > 0.0:
+            cost *= (1.0 + mass / heavy.mass) ** heavy.power
         cost *= one.counts + two.counts
         return cost[0].nan_to_num_(torch.inf, torch.inf).clamp_min_(0.0)
 

@@ -125,22 +125,21 @@ class AllocationConfig(Section):
             of cells merge, cheapest first. 1 keeps the cells of the tessellation.
         neighbors: Number of nearest cells that a cell may merge with.
         color: Weight of the squared colour distance relative to the cost of shape and position,
-            at one cell per Gaussian and a contrast of 0.2. The contrast is the root of half the
-            mean squared colour distance of neighbouring cells, limited to 0.06 to 0.28; the weight
-            is in inverse proportion to it.
-        color_power: This weight is proportional to the ratio of cells to Gaussians to this power;
-            colours differ anyway within large cells.
+            at one cell per Gaussian; in inverse proportion to the contrast over 0.2. This is the
+            root of half the mean squared colour distance of neighbours, limited to 0.06 to 0.28.
+        color_power: This weight is proportional to the ratio of cells to Gaussians to this power.
         view_color: Weight of view-dependent colours in this distance, as far as neighbours have
             them in common (:func:`cvtgs.cells.view_components`); 0 leaves them out.
         mass_power: The cost of a pair is multiplied by its apparent mass to this power, at a
             contrast of 0.2; the power is in proportion to the contrast.
         far_relief: Share by which ``mass_power`` is reduced where all mass lies beyond three robust
-            radii, and in proportion where some does: layers of far Gaussians hide one another, so
-            they show less than their mass. Below one cell per ten Gaussians, it is in proportion
-            to their ratio.
+            radii, and in proportion where some does: far Gaussians hide one another. Below one cell
+            per ten Gaussians, it is in proportion to their ratio.
         widest: Standard deviation of a cell in all directions together, divided by its distance
             from viewers, above which merging costs much more in scenes with far mass, so that
             merged skies do not become fog; 0 sets no limit.
+        heaviest: Apparent mass of a pair, in mean cells, around which merging begins to cost more
+            in scenes with far mass: for walls and skies of few Gaussians; 0 sets no limit.
         reassign: Whether every Gaussian then moves to the cell that explains it best.
     """
 
@@ -152,6 +151,7 @@ class AllocationConfig(Section):
     mass_power: float = pydantic.Field(default=0.5, ge=0.0, le=2.0)
     far_relief: Share = 0.55
     widest: Factor = 0.55
+    heaviest: Factor = 20.0
     reassign: bool = True
 
     @property
