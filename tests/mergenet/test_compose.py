@@ -10,8 +10,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import oracles
 from cvtgs import GaussianScene
 from cvtgs.devices import one_thread
+from cvtgs.math.parameters import normalize_quats
 from cvtgs.mergenet import Architecture, MergeNet, Residuals, compose
-from cvtgs.mergenet.apply import compose_published
+from cvtgs.mergenet.apply import FLATNESS, compose_published, turn_limits
 from cvtgs.mergenet.published import PublishedResiduals
 from mergenet_cases import Case, case_of, lively_net, some_case, some_labels
 from scenes import random_scene, same_bits
@@ -60,6 +61,24 @@ def test_growths_and_logits_are_added():
     assert torch.equal(small.logit_opacities, case.merged.logit_opacities + logits)
     rested = {name: getattr(case.merged, name) for name in ("log_scales", "logit_opacities")}
     assert same_bits(small.with_tensors(rested, {}), case.merged)
+
+
+def test_flat_cells_and_needles_hardly_tilt():
+    """A turn about an axis tilts the others into one another, by less the more they differ."""
+    logs = torch.tensor([[0.0, 0.1, -6.0], [2.0, -4.0, -4.0], [1.0, 0.0, -1.0]]).double()
+    tilt = [FLATNESS * math.exp(-gap) for gap in (6.1, 6.0)]
+    wanted = [[tilt[0], tilt[1], 1.0], [1.0, tilt[1], tilt[1]], [1.0, 1.0, 1.0]]
+    torch.testing.assert_close(turn_limits(logs), torch.tensor(wanted).double())
+    case = some_case()
+    flat = case.merged.log_scales.clone()
+    flat[:, 2] = flat[:, 1] - 7.0
+    case = case._replace(merged=case.merged.with_tensors({"log_scales": flat}))
+    turns = torch.full((12, 3), 0.4).double()
+    some, less = (composed(case, d_rotvecs=turns * factor).quats for factor in (1.0, 0.5))
+    own = normalize_quats(case.merged.quats)
+    tilted = [1.0 - (normalize_quats(quats) * own).sum(dim=1).abs() for quats in (some, less)]
+    assert bool((tilted[0] < 1.0 - math.cos(math.atan(0.21))).all())
+    assert bool((tilted[0] > tilted[1]).all())
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

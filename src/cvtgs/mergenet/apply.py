@@ -1,7 +1,9 @@
 """Apply MergeNet: correct the cells of a scene by the residuals that the network predicts."""
 
+import math
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -18,6 +20,10 @@ from cvtgs.mergenet.published import Net, PublishedMergeNet, PublishedResiduals,
 from cvtgs.scene import GaussianScene
 
 CHUNK_MEMBERS = 1 << 15  # members and neighbours per chunk; each takes about ``2 kB``
+
+FLATNESS = 25.0
+"""Ratio of standard deviations from which on turns between two axes are reduced: the ends of a
+flat cell leave its plane by many thicknesses, though its members hardly call for it."""
 
 _LARGEST = 1e15
 
@@ -227,7 +233,8 @@ def compose(
         >>> bool(torch.isclose(tensors["sh0"][0], scene.sh0[1], atol=1e-6).all())
         True
     """
-    tensors = _reshape(merged, cells, residuals)
+    turns = residuals.d_rotvecs * turn_limits(merged.log_scales.index_select(0, cells))
+    tensors = _reshape(merged, cells, replace(residuals, d_rotvecs=turns))
     ends = torch.arange(len(cells) + 1, device=cells.device) * neighbors.shape[1]
     others, pair_shares = neighbors.flatten(), residuals.pair_colors.flatten()
     member_totals = segment_sum(residuals.member_colors, part.offsets)[:, None, None]
@@ -244,6 +251,13 @@ def compose(
             bands = bands + (mixed - bands * member_totals) + (borrowed - bands * pair_totals)
         tensors[name] = bands
     return tensors
+
+
+def turn_limits(log_scales: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+    """Return factors of rotations about each axis, which turn the other two into one another."""
+    x, y, z = log_scales.unbind(1)
+    ratios = torch.stack([y - z, x - z, x - y], dim=1).abs()
+    return (math.log(FLATNESS) - ratios).clamp(max=0.0).exp()
 
 
 def compose_published(
