@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 import oracles
-from cvtgs import GaussianScene
+from cvtgs import GaussianScene, concatenate, synthetic
 
 REST_COUNTS = (0, 3, 8, 15)
 
@@ -124,3 +124,19 @@ def assert_standard(scene: GaussianScene) -> None:
     assert bool(((norms - 1).abs() < 1e-5).all())
     opacities = torch.sigmoid(scene.logit_opacities)  # those of the scene itself are clamped
     assert bool(((opacities > 0) & (opacities < 1)).all())
+
+
+def under_sky(count: int, *, distance: float, color: Tensor) -> GaussianScene:
+    """An object of 20,000 Gaussians under a sky of few, as wide as they are apart."""
+    thing = synthetic.scene("object", 20_000, sh_degree=0, seed=0)
+    generator = torch.Generator().manual_seed(1)
+    ways = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    sky = GaussianScene(
+        means=thing.means.median(dim=0).values + distance * ways,
+        quats=torch.randn(count, 4, generator=generator),
+        log_scales=torch.full((count, 3), math.log(2.0 * distance / math.sqrt(count))),
+        logit_opacities=torch.full((count,), 2.0),
+        sh0=color.expand(count, 1, 3).clone(),
+        shN=torch.zeros(count, 0, 3),
+    )
+    return concatenate([thing.with_tensors({}, {}), sky], fill=True)

@@ -1,15 +1,12 @@
 """Costs of pairs that hold much of the apparent mass of a scene that is mostly far."""
 
-import math
-from dataclasses import replace
-
 import pytest
 import torch
 
-import cvtgs
-from cvtgs import GaussianScene, Simplifier, SimplifyConfig, synthetic
+from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.cells import Moments, merge_pairs
 from cvtgs.config import AllocationConfig
+from scenes import under_sky
 
 
 def groups_at(places: list[float], masses: list[float]) -> Moments:
@@ -64,19 +61,8 @@ def test_the_factor_by_hand() -> None:
 
 def test_a_sky_of_few_gaussians_keeps_many_of_them() -> None:
     """Groups of few members would merge first."""
-    thing = synthetic.scene("object", 20_000, sh_degree=0, seed=0)
-    generator = torch.Generator().manual_seed(1)
-    ways = torch.nn.functional.normalize(torch.randn(200, 3, generator=generator), dim=1)
-    sky = GaussianScene(
-        means=thing.means.median(dim=0).values + 100.0 * ways,
-        quats=torch.randn(200, 4, generator=generator),
-        log_scales=torch.full((200, 3), math.log(15.0)),
-        logit_opacities=torch.full((200,), 2.0),
-        sh0=torch.rand(200, 1, 3, generator=generator),
-        shN=torch.zeros(200, 0, 3),
-    )
-    scene = cvtgs.concatenate([replace(thing, extras={}, layout=()), sky], fill=True)
-    kept = []
+    colors = torch.rand(200, 1, 3, generator=torch.Generator().manual_seed(2))
+    scene, kept = under_sky(200, distance=100.0, color=colors), []
     for heaviest in (0.0, 20.0):
         config = SimplifyConfig.from_mapping({"allocation": {"heaviest": heaviest}})
         small = Simplifier(None, config=config, device="cpu").simplify(scene, 0.1)

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from cvtgs import GaussianScene, Simplifier, concatenate, synthetic
+from cvtgs import GaussianScene, Simplifier
 from mergenet_cases import Case, are_corrected, case_of, features_of, fields_of, lively_net
-from scenes import random_scene
+from scenes import random_scene, under_sky
 
 COUNT = 48
 INF = math.inf
@@ -153,22 +153,9 @@ def test_cells_that_overflow_keep_the_reference(far):
 
 def test_a_sky_of_few_gaussians_keeps_its_colour():
     """The nearest other cells of its cells are small ones of the object in front of it."""
-    thing = synthetic.scene("object", 20_000, sh_degree=0, seed=0)
-    center = thing.means.median(dim=0).values
-    radius = float(torch.linalg.vector_norm(thing.means - center, dim=1).median())
-    generator = torch.Generator().manual_seed(1)
-    ways = torch.nn.functional.normalize(torch.randn(200, 3, generator=generator), dim=1)
     blue = torch.tensor([-0.5, 0.4, 1.4])
-    sky = GaussianScene(
-        means=center + 60 * radius * ways,
-        quats=torch.randn(200, 4, generator=generator),
-        log_scales=torch.full((200, 3), math.log(9 * radius)),
-        logit_opacities=torch.full((200,), 2.0),
-        sh0=blue.expand(200, 1, 3).clone(),
-        shN=torch.zeros(200, 0, 3),
-    )
-    scene = concatenate([thing.with_tensors({}, {}), sky], fill=True)
+    scene = under_sky(200, distance=240.0, color=blue)
     small = Simplifier(device="cpu").simplify(scene, 0.01)
-    is_far = torch.linalg.vector_norm(small.means - center, dim=1) > 20 * radius
-    assert 5 < int(is_far.sum()) < 100
+    is_far = small.means.norm(dim=1) > 80.0
+    assert 5 < int(is_far.sum()) < 150
     assert float((small.sh0[is_far, 0] - blue).abs().amax()) < 0.01
