@@ -220,7 +220,6 @@ def add_scores(index: LevelsIndex, folder: Path, evaluation: Evaluation) -> Leve
     scores = {one.name: one for one in evaluation.scenes}
     levels = tuple(level.with_scores(scores[level.file]) for level in index.levels)
     size = {"width": evaluation.width, "height": evaluation.height}
-    views = len(evaluation.views) - len(evaluation.blind)
-    index = index.model_copy(update={"levels": levels, "views": views, **size})
+    index = index.model_copy(update={"levels": levels, "views": evaluation.view_count, **size})
     write_atomically(folder / INDEX_NAME, index.to_json().encode(), overwrite=True)
     return index

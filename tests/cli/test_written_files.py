@@ -2,6 +2,7 @@
 
 import errno
 import os
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -130,6 +131,20 @@ def test_a_second_run_is_refused_before_it_writes(scene, capsys, name):
     assert error.startswith(start)
     assert error.count("\n") == 1
     assert sorted(path.name for path in scene.iterdir()) == ["in.ply"]
+
+
+def test_a_refused_run_leaves_the_folder_of_the_other_one(scene, monkeypatch):
+    """That run has made it since, and has not written to it yet."""
+
+    @contextmanager
+    def busy(options):
+        options.output.mkdir()
+        raise OutputBusyError("at work")
+        yield
+
+    monkeypatch.setattr("cvtgs.cli.main._lock", busy)
+    assert main(COMMANDS["levels"].replace("{}", str(scene)).split()) == 1
+    assert (scene / "out").is_dir()
 
 
 @pytest.mark.parametrize("name", ["levels", "stream", "render"])

@@ -4,18 +4,21 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from cvtgs import GaussianScene, Simplifier, concatenate, load, save
+from cvtgs import GaussianScene, Simplifier, SimplifyConfig, concatenate, load, save
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
 from cvtgs.io.atomic import replace_file
 from cvtgs.outofcore import LocalWorkers
+from cvtgs.scene import FLAT_LOG_SCALE
 from cvtgs.streams import plan_stream, stream_file, write_sog_stream
 from cvtgs.synthetic import scene as make
+from cvtgs.tags import TWO_SCALES
 
 RHOS = [1.0, 0.25, 0.05, 0.0125]
 COUNTS = [4000, 1000, 200, 50]
@@ -348,3 +351,17 @@ def test_all_files_are_in_a_mounted_folder(
     assert moved
     assert all(path.is_relative_to(out) for path in moved)
     assert names_in(tmp_path) == ["out", "scene.ply"]
+
+
+def test_flat_gaussians_that_become_thick_may_have_an_environment(tmp_path: Path) -> None:
+    """Some blocks keep all of theirs at the finest level, others do not; both lose the tag."""
+    scene = make("courtyard", 1200, sh_degree=0, seed=0)
+    log_scales = scene.log_scales.clone()
+    log_scales[:, 2] = FLAT_LOG_SCALE
+    flat = scene.with_tensors({"log_scales": log_scales}, {})
+    save(replace(flat, comments=(TWO_SCALES.text,), layout=()), tmp_path / "flat.ply")
+    config = SimplifyConfig.from_mapping({"preset": "draft", "effects": {"flat": "off"}})
+    options = {"kind": "sog", "blocks": 6, "chunk_gaussians": 50, "environment_radii": 0.5}
+    thick = Simplifier(config=config, device="cpu")
+    stream_file(tmp_path / "flat.ply", tmp_path / "out", [0.999, 0.05], simplifier=thick, **options)
+    assert (tmp_path / "out" / "environment").is_dir()

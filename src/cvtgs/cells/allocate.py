@@ -52,11 +52,8 @@ ROW_BITS, LAST_ROW = 32, (1 << 32) - 1  # keys to sort by have a row number in t
 class Heavy(NamedTuple):
     """The apparent mass of a heavy pair, 0 for none, and the power by which its cost grows."""
 
-    mass: float = 0.0
-    power: float = 0.0
-
-
-NEVER = Heavy()
+    mass: float
+    power: float
 
 
 @checked
@@ -174,7 +171,7 @@ def _pair_costs(
     first: Tensor,
     second: Tensor,
     config: AllocationConfig,
-    heavy: Heavy = NEVER,
+    heavy: Heavy,
 ) -> Float[Tensor, "p"]:
     """Return the cost of merging each pair, at least 0; infinite where float32 overflows."""
     volumes = _log_volume(table[6:12])  # the covariances

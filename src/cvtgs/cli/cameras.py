@@ -38,7 +38,7 @@ _MOST_SIZE = 1 << 14  # pixels; images of 4 : 3 take some gigabytes then
 def say_views(evaluation: "Evaluation") -> None:
     """Print the number, size and renderer of the images that scores are means over."""
     say(
-        f"{counted(len(evaluation.views) - len(evaluation.blind), 'view')} "
+        f"{counted(evaluation.view_count, 'view')} "
         f"of {evaluation.width} x {evaluation.height} pixels, rendered by {evaluation.backend}"
     )
 

@@ -335,7 +335,7 @@ def _page_data(comparison: Comparison, quality: int, factor: float) -> dict[str,
         "lpips": evaluation.lpips_network,
         "views": comparison.views,
         "shown": comparison.shown,
-        "scored": len(evaluation.views) - len(evaluation.blind),
+        "scored": evaluation.view_count,
         "reference": {
             "name": evaluation.reference,
             "count": evaluation.reference_count,

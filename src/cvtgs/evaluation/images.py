@@ -184,9 +184,10 @@ def load_photographs(
     """Read the photograph of every camera, at the cameras' size.
 
     The file name in the folder is the camera's name, or as many of its last parts as there are in
-    the folder; the suffix may differ or be missing in the camera's name. Other files, such as
-    masks, are ignored; transparent pixels show the background. Photographs of another size are
-    scaled to that of the cameras, in width and height independently.
+    the folder; the suffix may differ or be missing in the camera's name. Other files, and masks
+    of another format than that of the name, are ignored; transparent pixels show the background.
+    Photographs of another size are scaled to that of the cameras, in width and height
+    independently.
 
     Memory: ``12 c h w`` bytes.
 
@@ -199,7 +200,8 @@ def load_photographs(
         ``(c, h, w, 3)`` images in [0, 1], float32.
 
     Raises:
-        InvalidArgumentError: The cameras have no names, or two names match one photograph.
+        InvalidArgumentError: The cameras have no names, two names match one photograph, or a name
+            matches photographs of several formats, none of which is its own.
         InputNotFoundError: There is no such folder, or a camera has no photograph in it.
         InputError: A photograph cannot be read.
         FileFormatError: A photograph is no image.

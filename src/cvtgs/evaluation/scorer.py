@@ -35,8 +35,7 @@ class Score(Record):
     """One metric.
 
     Attributes:
-        mean: Mean over the views; over those that show something of the full scene, if any does.
-            Against photographs, all count.
+        mean: Mean over the views; against a full scene, over those that show something of it.
         views: The value of each view.
     """
 
@@ -105,16 +104,14 @@ class Evaluation(Record):
         reference: Name of the full scene.
         reference_count: Number of its Gaussians.
         views: Names of the views.
-        blind: Numbers of the views that show nothing of the full scene, which do not count in
-            means of scores against its images.
+        blind: Numbers of the views that show nothing of the full scene.
         width: Width of the images, pixels.
         height: Height of the images, pixels.
         backend: Name of the backend that rendered.
         lpips_network: The network of LPIPS; None if it was not measured.
         lpips_note: Why LPIPS was not measured, else empty.
         scenes: Scores of each simplified scene against images of the full one.
-        photographs: Scores of the full and of each simplified scene against photographs; empty
-            without photographs.
+        photographs: Scores of the full and of each simplified scene against photographs, if any.
     """
 
     reference: str
@@ -128,6 +125,11 @@ class Evaluation(Record):
     lpips_note: str = ""
     scenes: tuple[SceneScores, ...]
     photographs: tuple[SceneScores, ...] = ()
+
+    @property
+    def view_count(self) -> int:
+        """Number of views that count in means of scores against images of the full scene."""
+        return len(self.views) - len(self.blind)
 
     @property
     def lpips_sentence(self) -> str:
@@ -145,13 +147,11 @@ class EvaluationSettings:
 
     Attributes:
         background: Background colour: red, green and blue in [0, 1].
-        lpips: LPIPS network: ``vgg``, ``alex``, ``off``, or ``auto``, which omits LPIPS if there
-            are no weights.
+        lpips: LPIPS network: ``vgg``, ``alex``, ``off``, or ``auto`` (none without weights).
         backend: The rendering backend.
 
     Raises:
-        InvalidArgumentError: The background does not consist of three numbers in [0, 1], or there
-            is no such network or backend.
+        InvalidArgumentError: The background is no colour, or there is no such network or backend.
 
     Example:
         >>> EvaluationSettings(lpips="off").background

@@ -243,7 +243,7 @@ def how_measured(tradeoff: Tradeoff) -> str:
                 f"against the photographs. "
             )
     return (
-        f"{counted(len(evaluation.views) - len(evaluation.blind), 'view')} "
+        f"{counted(evaluation.view_count, 'view')} "
         f"of {evaluation.width} x {evaluation.height} pixels, rendered by {evaluation.backend}. "
         f"Every run is a separate process on {tradeoff.machine}. "
         f"{fitted_to(tradeoff)}{against}{evaluation.lpips_sentence}"
