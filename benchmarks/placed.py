@@ -40,6 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder to write to")
     options = parser.parse_args(arguments)
     ground = valid_part(cvtgs.load(options.ground))
+    options.output.mkdir(parents=True, exist_ok=True)
     for seed, file in enumerate(options.objects):
         path = options.output / f"placed-{file.stem}.ply"
         cvtgs.save(placed(valid_part(cvtgs.load(file)), ground, seed=seed), path, overwrite=True)

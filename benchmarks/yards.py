@@ -74,6 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="folder to write to")
     folder: Path = parser.parse_args(arguments).folder
+    folder.mkdir(parents=True, exist_ok=True)
     for name, (count, seed, degree) in YARDS.items():
         cvtgs.save(yard(count, seed=seed, degree=degree), folder / f"{name}.ply")
         (folder / f"{name}.cameras.json").write_text(json.dumps(beside_format(cameras())))
@@ -120,6 +121,11 @@ def far_surroundings(count: int, *, from_radius: float, seed: int) -> GaussianSc
         _sky(sky, rng),
         _floaters(floaters, rng),
     ]
+    return joined_parts(parts)
+
+
+def joined_parts(parts: Sequence[Part]) -> GaussianScene:
+    """Return the Gaussians of several parts as a scene of SH degree 0."""
     own = stored(Part(*(np.concatenate(columns) for columns in zip(*parts, strict=True))))
     own["shN"] = np.zeros((len(own["means"]), 0, 3))
     tensors: dict[str, Any] = {
@@ -165,9 +171,9 @@ def _ground(count: int, fine: float, rng: np.random.Generator) -> Part:
     size = np.maximum(radius, 0.7) * 0.012 * np.exp(rng.normal(0, 0.5, count)) * fine
     colors = np.array([0.28, 0.33, 0.14]) + 0.22 * _texture(means, rng)[:, None]
     colors = colors + rng.normal(0, 0.08, (count, 1)) + rng.normal(0, 0.02, (count, 3))
-    normals = _unit(np.array([0, -1, 0.0]) + rng.normal(0, 0.25, (count, 3)))
+    normals = unit(np.array([0, -1, 0.0]) + rng.normal(0, 0.25, (count, 3)))
     scales = np.stack([size, size * np.exp(rng.normal(0, 0.3, count)), size * 0.15], 1)
-    return Part(means, scales, _turned_to(normals), rng.beta(1.2, 0.8, count), colors)
+    return Part(means, scales, turned_to(normals), rng.beta(1.2, 0.8, count), colors)
 
 
 def _grass(count: int, fine: float, rng: np.random.Generator) -> Part:
@@ -175,11 +181,11 @@ def _grass(count: int, fine: float, rng: np.random.Generator) -> Part:
     height = -rng.uniform(0, 0.08, count)
     means = np.stack([radius * np.cos(turn), height, radius * np.sin(turn)], 1)
     length = 0.02 * np.exp(rng.normal(0, 0.4, count)) * fine**0.7
-    blades = _unit(np.array([0, -1, 0.0]) + rng.normal(0, 0.4, (count, 3)))
+    blades = unit(np.array([0, -1, 0.0]) + rng.normal(0, 0.4, (count, 3)))
     scales, opacities = np.stack([length * 0.2, length * 0.2, length], 1), rng.beta(1, 0.9, count)
     colors = np.array([0.35, 0.42, 0.15]) + 0.2 * _texture(means, rng)[:, None]
     colors = colors + rng.normal(0, 0.12, (count, 1))
-    return Part(means, scales, _turned_to(blades), opacities, colors)
+    return Part(means, scales, turned_to(blades), opacities, colors)
 
 
 def _walls(count: int, fine: float, rng: np.random.Generator) -> Part:
@@ -192,7 +198,7 @@ def _walls(count: int, fine: float, rng: np.random.Generator) -> Part:
     )
     means = np.where(kind == 0, house, np.where(kind == 1, low, fence))
     normals = np.where(kind == 1, [0, 0, 1], [1, 0, 0]).astype(float)
-    normals = _unit(normals + rng.normal(0, 0.1, (count, 3)))
+    normals = unit(normals + rng.normal(0, 0.1, (count, 3)))
     size = 0.03 * np.exp(rng.normal(0, 0.6, count)) * fine
     joints = (np.sin(means[:, 1] * 40) > 0.8) * -0.2
     placed = means + rng.normal(0, 0.02, means.shape)
@@ -200,7 +206,7 @@ def _walls(count: int, fine: float, rng: np.random.Generator) -> Part:
     colors = np.array([0.6, 0.5, 0.42]) + 0.15 * _texture(means, rng)[:, None] + joints[:, None]
     colors = colors + rng.normal(0, 0.05, (count, 1))
     scales = np.stack([size, size, size * 0.1], 1)
-    return Part(placed, scales, _turned_to(normals), opacities, colors)
+    return Part(placed, scales, turned_to(normals), opacities, colors)
 
 
 def _trees(count: int, rng: np.random.Generator) -> Part:
@@ -211,7 +217,7 @@ def _trees(count: int, rng: np.random.Generator) -> Part:
     crown = rng.integers(0, 14, count)
     means = crowns[crown] + rng.normal(0, 1, (count, 3)) * [1.6, 1.4, 1.6]
     size = np.linalg.norm(means, axis=1) * 0.006 * np.exp(rng.normal(0, 0.6, count))
-    quats = _unit(rng.normal(size=(count, 4)))
+    quats = unit(rng.normal(size=(count, 4)))
     scales = size[:, None] * np.exp(rng.normal(0, 0.5, (count, 3)))
     opacities = rng.beta(0.8, 1.2, count)
     colors = np.array([0.16, 0.26, 0.1]) + 0.12 * _texture(means, rng)[:, None]
@@ -221,12 +227,12 @@ def _trees(count: int, rng: np.random.Generator) -> Part:
 def _sky(count: int, rng: np.random.Generator) -> Part:
     ways = rng.normal(size=(count, 3))
     ways[:, 1] = -np.abs(ways[:, 1]) * 0.9 + 0.05
-    ways = _unit(ways)
+    ways = unit(ways)
     away = np.exp(rng.uniform(np.log(40), np.log(250), count))
     size = away * 0.05 * np.exp(rng.normal(0, 0.7, count))
     up = np.clip(-ways[:, 1], 0, 1)[:, None]
     scales = size[:, None] * np.exp(rng.normal(0, 0.6, (count, 3)))
-    quats, opacities = _unit(rng.normal(size=(count, 4))), rng.beta(0.6, 1.6, count)
+    quats, opacities = unit(rng.normal(size=(count, 4))), rng.beta(0.6, 1.6, count)
     colors = (1 - up) * [0.85, 0.88, 0.92] + up * [0.45, 0.62, 0.9]
     colors = colors + 0.06 * _texture(ways * 30, rng)[:, None]
     return Part(ways * away[:, None], scales, quats, opacities, colors)
@@ -238,10 +244,10 @@ def _floaters(count: int, rng: np.random.Generator) -> Part:
     away = np.exp(rng.uniform(np.log(1), np.log(30), count))[:, None]
     size = away * 0.015 * np.exp(rng.normal(0, 0.8, count))[:, None]
     scales = size * np.exp(rng.normal(0, 0.5, (count, 3)))
-    quats = _unit(rng.normal(size=(count, 4)))
+    quats = unit(rng.normal(size=(count, 4)))
     opacities = 0.1 * rng.beta(0.6, 1.2, count) + 0.004
     colors = rng.uniform(0.2, 0.8, (count, 1)) + rng.normal(0, 0.05, (count, 3))
-    return Part(_unit(ways) * away, scales, quats, opacities, colors)
+    return Part(unit(ways) * away, scales, quats, opacities, colors)
 
 
 def _texture(points: Array, rng: np.random.Generator) -> Array:
@@ -254,15 +260,15 @@ def _texture(points: Array, rng: np.random.Generator) -> Array:
     return total
 
 
-def _unit(vectors: Array) -> Array:
+def unit(vectors: Array) -> Array:
     lengths: Array = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / lengths
 
 
-def _turned_to(normals: Array) -> Array:
+def turned_to(normals: Array) -> Array:
     """Return quaternions that rotate the third axis to the normals."""
     third = np.broadcast_to(np.array([0, 0, 1.0]), normals.shape)
-    return _unit(np.concatenate([1 + normals[:, 2:], np.cross(third, normals)], axis=1))
+    return unit(np.concatenate([1 + normals[:, 2:], np.cross(third, normals)], axis=1))
 
 
 if __name__ == "__main__":
