@@ -42,6 +42,11 @@ def test_a_mean_is_equal_only_if_all_views_are(values, text):
     assert vars(comparison_files)["_mean_psnr_text"](Score.of(values)) == text
 
 
+def test_views_that_show_nothing_are_not_among_the_equal_ones():
+    score = Score(mean=math.inf, views=(20.0, math.inf, math.inf, 12.0))
+    assert vars(comparison_files)["_mean_psnr_text"](score, (1, 3)) == "20.00 dB, 1 equal"
+
+
 def test_names_of_images_that_are_not_utf_8_are_escaped() -> None:
     names = ("Geb\udce4ude.png", "two\nlines.png", "Geb\xe4ude.png")
     scene, cameras = random_scene(30), replace(ring(3), names=names)

@@ -158,7 +158,7 @@ def _small_row(comparison: Comparison, scores: SceneScores, images: Images) -> _
         counted(scores.count, "Gaussian"),
         _ratio_text(comparison.ratio(scores)),
         _size_text(comparison, scores.name),
-        f"PSNR {_mean_psnr_text(scores.psnr)}",
+        f"PSNR {_mean_psnr_text(scores.psnr, comparison.evaluation.blind)}",
         f"SSIM {scores.ssim.mean:.3f}",
         f"LPIPS {scores.lpips.mean:.3f}" if scores.lpips else "",
         f"alpha error {scores.alpha_error.mean:.4f}" if scores.alpha_error else "",
@@ -238,13 +238,14 @@ def _psnr_text(value: float) -> str:
     return "equal" if math.isinf(value) else f"{value:.2f} dB"
 
 
-def _mean_psnr_text(psnr: Score) -> str:
-    """Return the mean; if only some views are equal, that of the others."""
-    finite = [value for value in psnr.views if math.isfinite(value)]
+def _mean_psnr_text(psnr: Score, blind: Sequence[int] = ()) -> str:
+    """Return the mean; if only some of the views that count are equal, that of the others."""
+    counted_ones = [value for view, value in enumerate(psnr.views) if view not in blind]
+    finite = [value for value in counted_ones if math.isfinite(value)]
     if math.isfinite(psnr.mean) or not finite:
         return _psnr_text(psnr.mean)
-    others, equal = Score.of(finite).mean, len(psnr.views) - len(finite)
-    return f"{_psnr_text(others)}, {equal} equal"
+    equal = len(counted_ones) - len(finite)
+    return f"{_psnr_text(Score.of(finite).mean)}, {equal} equal"
 
 
 def _size_text(comparison: Comparison, name: str) -> str:
@@ -335,6 +336,7 @@ def _page_data(comparison: Comparison, quality: int, factor: float) -> dict[str,
         "lpips": evaluation.lpips_network,
         "views": comparison.views,
         "shown": comparison.shown,
+        "blind": evaluation.blind,
         "scored": evaluation.view_count,
         "reference": {
             "name": evaluation.reference,

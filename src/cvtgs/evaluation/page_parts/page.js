@@ -10,10 +10,11 @@
   const count = (value) => number(value, 0);
   const decibels = (value) => (Number.isFinite(Number(value)) ? number(Number(value), 2) + " dB" : "equal");
   const meanDecibels = ({ mean, views }) => {
-    const finite = views.map(Number).filter(Number.isFinite);
+    const counted = views.map(Number).filter((value, view) => !data.blind.includes(view));
+    const finite = counted.filter(Number.isFinite);
     if (Number.isFinite(Number(mean)) || !finite.length) return decibels(mean);
     const others = finite.reduce((sum, value) => sum + value, 0) / finite.length;
-    return `${decibels(others)}, ${views.length - finite.length} equal`;
+    return `${decibels(others)}, ${counted.length - finite.length} equal`;
   };
   const bytes = (value) => {
     if (value === null) return "";
