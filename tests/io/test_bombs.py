@@ -22,6 +22,7 @@ from cvtgs.errors import FileFormatError
 from cvtgs.io.files import FREE_BYTES, MOST_EXPANSION
 from cvtgs.io.gltf.document import SPLATS, SPZ, write_chunks
 from format_cases import DATA, refusal
+from gltf_cases import parts
 from scenes import random_scene
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="measures memory as Linux does")
@@ -230,6 +231,55 @@ def test_spz_that_many_nodes_repeat_counts_as_often(
         f"file, found {40 * count:,} Gaussians that take {40 * count * 56:,} bytes in a file of "
         f"{size:,}; if you trust the file, pass trust_sizes=True (--trust-sizes)."
     )
+
+
+def test_a_buffer_beside_a_gltf_counts_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the bytes of the scene, also in its size on the disk; not again under other numbers."""
+    monkeypatch.setattr("cvtgs.io.files.FREE_BYTES", 0)
+    path, scene = tmp_path / "a.gltf", random_scene(4000, degree=3)
+    cvtgs.save(scene, tmp_path / "a.glb")
+    content = (tmp_path / "a.glb").read_bytes()
+    document, binary = parts(content)
+    (tmp_path / "a.bin").write_bytes(binary)
+    document["buffers"][0]["uri"] = "a.bin"
+    path.write_text(json.dumps(document))
+    assert len(cvtgs.load(path)) == 4000
+    assert cvtgs.io.scene_size(path) == path.stat().st_size + len(binary)
+    spz = gzip.compress(spz_header(100_000) + bytes(2_000_000), 9)
+    (tmp_path / "a.bin").write_bytes(spz)
+    places = range(30)
+    document = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [
+            {
+                "primitives": [
+                    {"mode": 0, "extensions": {SPLATS: {"extensions": {SPZ: {"bufferView": k}}}}}
+                    for k in places
+                ]
+            }
+        ],
+        "bufferViews": [{"buffer": k, "byteLength": len(spz)} for k in places],
+        "buffers": [
+            {"uri": "./a.bin" if k % 2 else "a.bin", "byteLength": len(spz)} for k in places
+        ],
+    }
+    path.write_text(json.dumps(document))
+    stored = path.stat().st_size + len(spz)
+    assert f"found 3,000,000 Gaussians that take 168,000,000 bytes in a file of {stored:,};" in str(
+        refusal(path)
+    )
+
+
+@pytest.mark.parametrize("uri", ["missing.bin", "../a.bin", 3, None])
+def test_the_size_of_a_damaged_gltf_is_that_of_its_file(tmp_path: Path, uri: object) -> None:
+    path = tmp_path / "a.gltf"
+    for text in (json.dumps({"buffers": [{"uri": uri}]}), "[]", "{", '{"buffers": [1]}'):
+        path.write_text(text)
+        assert cvtgs.io.scene_size(path) == len(text)
 
 
 def test_files_of_a_stream_are_read_up_to_the_one_that_is_too_much(tmp_path: Path) -> None:

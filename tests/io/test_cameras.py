@@ -306,6 +306,15 @@ def test_a_colmap_model_with_byte_order_marks_is_read(tmp_path) -> None:
     assert torch.equal(marked.Ks, plain.Ks)
 
 
+def test_text_files_that_are_asked_for_are_read_beside_binary_ones(tmp_path) -> None:
+    colmap_txt(tmp_path, rows=range(2), names=["text a.jpg", "text b.jpg"])
+    colmap_bin(tmp_path, rows=range(2), names=["binary a.jpg", "binary b.jpg"])
+    for name in ("images.txt", "cameras.txt"):
+        assert load_cameras(tmp_path / name).names == ("text a.jpg", "text b.jpg")
+    for path in (tmp_path, tmp_path / "images.bin"):
+        assert load_cameras(path).names == ("binary a.jpg", "binary b.jpg")
+
+
 def test_text_models_with_spaces_in_names_and_points_are_read(tmp_path) -> None:
     colmap_txt(tmp_path, rows=range(2), names=["b c.jpg", "a  d.jpg"], points="1 2 3 4.5 5 -1")
     assert load_cameras(tmp_path).names == ("a  d.jpg", "b c.jpg")

@@ -142,6 +142,30 @@ def test_the_transforms_of_nodes_move_gaussians(small: Path) -> None:
     assert_within(wanted, found, {"means": 3e-6, "log_scales": 1e-6, "shN": 1e-6, "angle": 1e-3})
 
 
+@pytest.mark.parametrize("factor", [0.9998, 2.0, 1e200])
+def test_rotations_of_nodes_need_not_have_unit_length(small: Path, factor: float) -> None:
+    half = math.sqrt(0.5)
+    quat = [0.0, half, 0.0, half]
+    changed(small, lambda d: d["nodes"][0].update(rotation=quat))
+    wanted = load(small)
+    changed(small, lambda d: d["nodes"][0].update(rotation=[factor * part for part in quat]))
+    found = load(small)
+    assert torch.equal(found.log_scales, wanted.log_scales)
+    torch.testing.assert_close(found.means, wanted.means)
+
+
+def test_coefficients_above_degree_3_are_warned_about(small: Path) -> None:
+    save(storable_scene(5, degree=3), small, overwrite=True)
+
+    def extend(document: dict[str, Any]) -> None:
+        attributes = primitive(document)["attributes"]
+        attributes[f"{NAME}:SH_DEGREE_4_COEF_0"] = attributes[f"{NAME}:SH_DEGREE_3_COEF_0"]
+
+    changed(small, extend)
+    with pytest.warns(DroppedDataWarning, match="left out SH coefficients above degree 3"):
+        assert load(small).sh_degree == 3
+
+
 def test_all_nodes_and_primitives_are_read(small: Path) -> None:
     def repeat(document: dict[str, Any]) -> None:
         points = {"mode": 0, "attributes": {"POSITION": 0}}

@@ -215,6 +215,18 @@ def test_meshes_of_many_primitives_are_not_multiplied_by_nodes(
     assert calls <= 2 * (1 + is_splat) * 501
 
 
+@pytest.mark.parametrize(
+    "change",
+    [{"translation": [1e39, 0, 0]}, {"scale": [1e39] * 3}, {"scale": [1e-39] * 3}],
+    ids=["far", "large", "small"],
+)
+def test_nodes_that_move_gaussians_too_far_are_named(small: Path, change: dict[str, Any]) -> None:
+    changed(small, lambda d: d["nodes"][0].update(change))
+    text = str(refusal(small))
+    assert text.startswith(f"{small}: a node moves Gaussians too far: a motion must ")
+    assert text.count(".") == text.removesuffix(".").count(".") + 1
+
+
 def test_damaged_spz_data_inside_a_glb_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.spz.glb"
     save(storable_scene(9), path)

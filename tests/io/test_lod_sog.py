@@ -263,6 +263,12 @@ def test_the_highest_degree_of_the_files_limits_their_expansion(
     assert checked == [(5, 1), (7, 1)]
 
 
+def test_png_images_of_a_stream_count_as_stored_bytes(stream: Path) -> None:
+    before = scene_size(stream)
+    (stream / "0_0" / "means_l.png").write_bytes(bytes(1000))
+    assert scene_size(stream) == before + 1000
+
+
 def test_the_palette_splits_no_column_that_varies_by_rounding_only() -> None:
     rng = np.random.default_rng(0)
     rows = rng.normal(0, 1e-2, (6000, 2)).astype(np.float32)

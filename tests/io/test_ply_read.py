@@ -140,6 +140,20 @@ def test_double_coordinates_make_a_float64_scene(tmp_path: Path, axes: str) -> N
     assert scene.means[0, 0].item() == 0.1
 
 
+def test_integers_beside_doubles_are_written_as_doubles(tmp_path: Path) -> None:
+    """Positions in metres of a survey; a float would round them."""
+    properties = [
+        (name, {"x": "double", "y": "int"}.get(name, kind)) for name, kind in gaussian_properties()
+    ]
+    rows = gaussian_rows(properties, 2)
+    rows[0][1], rows[1][1] = 35_000_007, 5
+    write_ply_file(tmp_path / "in.ply", properties, rows)
+    scene = load(tmp_path / "in.ply")
+    assert dict(scene.layout)["y"] == "double"
+    save(scene, tmp_path / "out.ply")
+    assert load(tmp_path / "out.ply").means[:, 1].tolist() == [35_000_007.0, 5.0]
+
+
 def test_standard_properties_may_be_integers(tmp_path: Path) -> None:
     properties = [
         (name, "uchar" if name == "opacity" else kind) for name, kind in gaussian_properties()

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from cvtgs.errors import DroppedDataWarning, FileFormatError, InvalidSceneError
-from cvtgs.io import load, save
+from cvtgs.io import load, losses, save
 from cvtgs.io.ply import write
 from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 from cvtgs.text import shown
@@ -202,8 +202,12 @@ def test_scenes_of_2dgs_are_written_without_a_third_scale(tmp_path: Path) -> Non
     with pytest.warns(DroppedDataWarning) as caught:
         save(replace(scene, log_scales=thick), tmp_path / "t.ply")
     assert str(caught[0].message) == (
-        "the third scale of 2 Gaussians was left out, since the file that the scene came from has "
-        "no scale_2 (2DGS)."
+        f"{tmp_path / 't.ply'}: left out the third scale of 2 Gaussians, since the file that the "
+        f"scene came from has no scale_2 (2DGS)."
+    )
+    assert losses(replace(scene, log_scales=thick), "t.ply").dropped == (
+        "the third scale of 2 Gaussians, since the file that the scene came from has no scale_2 "
+        "(2DGS)",
     )
     assert caught[0].filename == __file__
 
@@ -267,7 +271,7 @@ def test_parameters_with_gradients_can_be_saved(tmp_path: Path) -> None:
             "PLY, found 1,048,996.",
         ),
         (
-            {"layout": (("x", "half"),)},
+            {"layout": (("x", "half"), ("scale_2", "float"))},
             "the layout must give property 'x' one of the types char, uchar, short, ushort, int, "
             "uint, float, double, found 'half'.",
         ),

@@ -1,5 +1,6 @@
 """Gaussians with two scales (2DGS), in files that keep three: the tag 2dgs of splat-transform."""
 
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from cvtgs import Simplifier, SimplifyConfig, concatenate, load, save
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError
 from cvtgs.scene import FLAT_LOG_SCALE
 from cvtgs.streams import plan_stream, write_sog_stream, write_tiles
-from cvtgs.tags import TWO_SCALES
+from cvtgs.tags import ANTIALIASED, TWO_SCALES
 from hard_cases import flat_file
 from scenes import random_scene
 
@@ -31,6 +32,20 @@ def test_merged_gaussians_of_any_format_are_flat(tmp_path: Path, suffix: str) ->
 def test_formats_without_the_tag_warn(tmp_path: Path, suffix: str) -> None:
     with pytest.warns(DroppedDataWarning, match="the tag 'SplatRenderMode: 2dgs', without which"):
         save(flat_file(300, torch.float32), tmp_path / f"flat{suffix}")
+
+
+def test_a_sog_with_the_tag_mip_has_no_other(tmp_path: Path) -> None:
+    flat, path = flat_file(300, torch.float32), tmp_path / "both.sog"
+    both = replace(flat, comments=(ANTIALIASED.text, TWO_SCALES.text))
+    with pytest.warns(DroppedDataWarning, match="the tag 'SplatRenderMode: 2dgs', without which"):
+        save(both, path)
+    assert load(path).comments == (ANTIALIASED.text,)
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    files["meta.json"] = files["meta.json"].replace(b'"antialiased"', b'"2dgs"')
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    assert load(tmp_path / "meta.json").comments == (ANTIALIASED.text, TWO_SCALES.text)
 
 
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")

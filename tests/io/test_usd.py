@@ -61,6 +61,16 @@ def test_extent_holds_three_sigmas(tmp_path: Path) -> None:
     torch.testing.assert_close(high, (turned.means + 3 * sigmas).amax(dim=0))
 
 
+@pytest.mark.parametrize("log_scale", [88.5, 800.0])
+@pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
+def test_extent_stays_within_float32(tmp_path: Path, log_scale: float) -> None:
+    scene = storable_scene(3)
+    text = written(
+        scene.with_tensors(log_scales=torch.full((3, 3), log_scale)), tmp_path / "a.usda"
+    )
+    assert all(abs(number) <= 3.4028235e38 for number in array(text, "float3[] extent"))
+
+
 def test_arrays_written_in_parts_are_joined(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import time
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -99,6 +100,17 @@ def test_gaussians_that_the_coarsest_level_left_out_take_no_quadratic_time():
         seconds.append(time.process_time() - start)
         assert sum(len(chunk.rows[0]) for chunk in chunks) == 20_000
     assert seconds[1] < seconds[0] + 0.5
+
+
+def test_levels_that_require_gradients_are_planned():
+    """Without torch's warning that a tensor became a number."""
+    plain, tracked = level([0.0, 1.0, 5.0], None), level([0.0, 1.0, 5.0], None)
+    tensors = {name: one.requires_grad_() for name, one in plain.scene.tensors().items()}
+    tracked.scene = plain.scene.with_tensors(tensors)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = plan_stream([tracked])
+    assert found.root.box_max == plan_stream([plain]).root.box_max
 
 
 def test_a_box_reaches_three_deviations_along_every_axis():

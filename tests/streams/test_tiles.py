@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from cvtgs import GaussianScene, Simplifier, load, save
+from cvtgs.errors import DroppedDataWarning
 from cvtgs.streams import geo_transform, plan_stream, stream_file, write_tiles
 from cvtgs.synthetic import scene as make
 
@@ -35,6 +37,17 @@ def placed(folder: Path) -> Iterator[tuple[dict[str, Any], Tensor]]:
 
     root = json.loads((folder / "tileset.json").read_text())["root"]
     yield from below(root, torch.eye(4, dtype=torch.float64))
+
+
+def test_flyaways_are_clamped_without_warnings_of_numpy(tmp_path: Path) -> None:
+    scene = make("object", 400, sh_degree=1, seed=0)
+    means = scene.means.clone()
+    means[0] = 1e38
+    levels = FAST.levels(scene.with_tensors(means=means), [0.5])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        warnings.simplefilter("ignore", DroppedDataWarning)
+        write_tiles(plan_stream(levels), tmp_path / "tiles")
 
 
 def in_tile_axes(scene: GaussianScene) -> Tensor:

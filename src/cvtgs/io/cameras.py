@@ -169,7 +169,8 @@ def load_cameras(path: str | os.PathLike[str], *, split: Split | None = None) ->
 
     Args:
         path: A folder, or one of these files.
-        split: ``"train"``, ``"test"``, or None for all cameras, training first.
+        split: ``"train"``, ``"test"``, or None for all cameras, in the order of the file; those
+            of ``transforms_train.json`` come before those of ``transforms_test.json``.
 
     Returns:
         The cameras, float64 on the CPU; their names are the image names or paths in the file.
@@ -226,7 +227,7 @@ def _file_views(path: Path, split: Split | None) -> list[View]:
     if path.name in _COLMAP_FILES:
         from cvtgs.io.colmap import colmap_views  # noqa: PLC0415 (when it is read)
 
-        return hold_out(colmap_views(path.parent), split)
+        return hold_out(colmap_views(path.parent, as_text=path.suffix == ".txt"), split)
     if path.suffix.lower() != ".json" and is_file(path):
         raise FileFormatError(
             f"{path}: a camera file must be JSON (.json) or part of a COLMAP model "

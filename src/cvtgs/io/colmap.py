@@ -69,9 +69,9 @@ def is_colmap(folder: Path) -> bool:
     return any(is_file(folder / f"images.{suffix}") for suffix in ("bin", "txt"))
 
 
-def colmap_views(folder: Path) -> list[View]:
-    """Read a sparse model; binary files take precedence over text files."""
-    if is_file(folder / "images.bin"):
+def colmap_views(folder: Path, *, as_text: bool = False) -> list[View]:
+    """Read a sparse model; binary files take precedence, unless its text files are asked for."""
+    if is_file(folder / "images.bin") and not as_text:
         lenses = _cameras_of_bin(folder / "cameras.bin")
         images = _images_of_bin(folder / "images.bin")
         path = folder / "images.bin"

@@ -5,9 +5,10 @@ import os
 import re
 import stat
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, BinaryIO, ClassVar, TypeVar, get_args
+from urllib.parse import unquote
 
 import pydantic
 from pydantic import AllowInfNan, BeforeValidator, Field, Strict
@@ -37,6 +38,7 @@ FREE_BYTES = 1 << 26
 """A scene of at most this many bytes in memory may come from a file of any size."""
 MOST_EXPANSION = 64
 """Beyond that, a scene may take this many times the bytes of its file; real ones take 4 to 13."""
+MOST_JSON_BYTES = 1 << 26  # a larger .gltf has its buffers inside
 LONGEST_NAME = 255  # characters that file systems allow in a name
 _FLOATS = 11  # numbers of a Gaussian without SH coefficients
 _MOST_WHOLE = 1 << 53  # whole numbers up to here are the same in every JSON parser
@@ -125,7 +127,8 @@ def scene_size(path: str | os.PathLike[str]) -> int:
         path: A file, or a folder that :func:`scene_file` finds a scene in.
 
     Returns:
-        Bytes of its file; for an unbundled or a streamed SOG, also those of its other files.
+        Bytes of its file; for an unbundled or a streamed SOG, or a ``.gltf``, also those of its
+        other files.
 
     Raises:
         InputNotFoundError: There is no such file.
@@ -138,13 +141,25 @@ def scene_size(path: str | os.PathLike[str]) -> int:
         0
     """
     file = scene_file(path)
-    streamed = ("**/*.webp", "**/*.sog", "**/meta.json")
-    patterns = {"meta.json": ("*.webp",), "lod-meta.json": streamed}.get(file.name, ())
-    parts = [part for pattern in patterns for part in file.parent.glob(pattern)]
     with input_errors(file):
+        parts = _parts_of(file)
         if not is_file(file):  # also a name that no file can have
             raise _not_regular(file) if os.path.exists(file) else FileNotFoundError  # noqa: PTH110
         return sum(part.stat().st_size for part in (file, *parts))
+
+
+def _parts_of(file: Path) -> list[Path]:
+    """Return the other files of a scene of several files."""
+    images = ("*.webp", "*.png")
+    streamed = ("**/*.webp", "**/*.png", "**/*.sog", "**/meta.json")
+    patterns = {"meta.json": images, "lod-meta.json": streamed}.get(file.name, ())
+    if file.suffix.lower() == ".gltf" and is_file(file) and file.stat().st_size < MOST_JSON_BYTES:
+        with suppress(FileFormatError, AttributeError, KeyError, TypeError):  # a damaged file
+            buffers = parse_json(file.read_bytes(), file).get("buffers", [])
+            names = {unquote(buffer["uri"]) for buffer in buffers if "uri" in buffer}
+            places = [file.parent / name for name in names if is_within(name)]
+            return [place for place in places if is_file(place)]
+    return [part for pattern in patterns for part in file.parent.glob(pattern)]
 
 
 def _scenes(folder: Path) -> Iterator[Path]:

@@ -247,7 +247,8 @@ def save(
     scene = scene if suffix == ".ply" else tagged_if_flat(scene)
     dropped = losses(scene, named).dropped
     if dropped:
-        warn(f"{name}: files of this format do not hold {'; '.join(dropped)}.", DroppedDataWarning)
+        left_out = "left out" if suffix == ".ply" else "files of this format do not hold"
+        warn(f"{name}: {left_out} {'; '.join(dropped)}.", DroppedDataWarning)
     options = {"version": spz_version, "axes": axes} if suffix == ".spz" else {}
     write: Callable[..., None] = resolve_name(_WRITERS[suffix])
     # Values that a format cannot hold are clamped; numpy would warn of their overflow.
@@ -271,8 +272,8 @@ def losses(scene: GaussianScene, path: str | os.PathLike[str], *, spz_version: i
         spz_version: Version of a ``.spz``, as in :func:`save`.
 
     Returns:
-        The data that would be dropped, and rounded or reordered (none for a ``.ply``), and the
-        number and SH degree of the Gaussians in the file.
+        The data that would be dropped, and rounded or reordered, and the number and SH degree of
+        the Gaussians in the file. A ``.ply`` holds all but a third scale that the layout lacks.
 
     Raises:
         FileFormatError: The format is unknown or cannot be written.
@@ -290,7 +291,11 @@ def losses(scene: GaussianScene, path: str | os.PathLike[str], *, spz_version: i
     suffix = _suffix_of(named, _WRITERS)
     limits = SPZ_2 if suffix == ".spz" and spz_version == 2 else FORMAT_LIMITS.get(suffix)
     if limits is None:
-        return Losses(dropped=(), changed=(), count=len(scene), sh_degree=scene.sh_degree)
+        from cvtgs.io.ply.write import lost_scales  # noqa: PLC0415 (only where written)
+
+        lost = lost_scales(scene)
+        dropped = (lost,) if lost else ()
+        return Losses(dropped=dropped, changed=(), count=len(scene), sh_degree=scene.sh_degree)
     return losses_within(scene, limits)
 
 

@@ -14,7 +14,7 @@ from cvtgs.validity import coarse_step, lost_step, writable_rows
 SPZ_STEPS = 1 << 23
 """Steps of the coordinates of a ``.spz`` on each side of the origin."""
 
-SCALE_RANGE = (-87.3, 88.7)  # logarithms of the scales that float32 holds with full precision
+SCALE_RANGE = (-87.34, 88.7)  # logarithms of the scales that float32 holds with full precision
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +43,8 @@ class FormatLimits:
     """Whether files record that a scene was trained with anti-aliasing."""
     comments: bool = False
     two_scales: bool = False
-    """Whether files record that Gaussians are flat; files with comments do so by a tag."""
+    """Whether files record that Gaussians are flat, unless they record anti-aliasing; files with
+    comments do so by a tag."""
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Minimum and maximum of the values of a tensor, by its name."""
     fixed_point: bool = False
@@ -178,7 +179,8 @@ def dropped_within(scene: GaussianScene, limits: FormatLimits) -> dict[str, int]
     if scene.antialiased and not limits.antialiased:
         tag = f"the tag '{ANTIALIASED.text}', without which viewers show the scene too sharp"
         dropped[tag] = 0
-    if scene.has_two_scales and not (limits.two_scales or limits.comments):
+    records_flatness = limits.comments or (limits.two_scales and not scene.antialiased)
+    if scene.has_two_scales and not records_flatness:
         tag = f"the tag '{TWO_SCALES.text}', without which merged Gaussians of the file are thick"
         dropped[tag] = 0
     if scene.dtype == torch.float64:

@@ -7,10 +7,11 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from hashlib import sha256
 from pathlib import Path
 
 from cvtgs.errors import OutputBusyError, OutputError, reason_of
-from cvtgs.io.files import is_folder
+from cvtgs.io.files import LONGEST_NAME, is_folder
 
 
 @contextmanager
@@ -75,7 +76,11 @@ def hidden_path(path: str | os.PathLike[str], ending: str) -> Path:
     is_apart = os.path.ismount(target) or not os.access(target.parent, os.W_OK | os.X_OK)
     if is_folder(target) and is_apart:
         return target / f".{ending}"
-    return target.with_name(f".{target.name}.{ending}")
+    name = f".{target.name}.{ending}"
+    if len(os.fsencode(name)) > LONGEST_NAME:
+        start = os.fsencode(target.name)[: LONGEST_NAME // 2].decode(errors="ignore")
+        name = f".{start}.{sha256(os.fsencode(target.name)).hexdigest()[:16]}.{ending}"
+    return target.with_name(name)
 
 
 def _signature() -> str:

@@ -70,10 +70,7 @@ def file_of(
         except InputError:
             raise
         except OSError as error:
-            raise OutputError(
-                f"the folder of temporary files must be writable and have room for a copy of "
-                f"{name}, found: {reason_of(error)}; TMPDIR sets another folder."
-            ) from error
+            raise _no_room(f"of {name}", error) from error
         suffix = format or _format_of(path, start)
         copy, path = path, path.with_name(f"stream{suffix}")
         replace_file(copy, path)
@@ -86,6 +83,13 @@ def file_of(
             if folder not in text:
                 raise
             raise type(error)(_renamed(text, path, name)) from error
+
+
+def _no_room(what: str, error: OSError) -> OutputError:
+    return OutputError(
+        f"the folder of temporary files must be writable and have room for a copy {what}, found: "
+        f"{reason_of(error)}; TMPDIR sets another folder."
+    )
 
 
 def _free_frames(error: BaseException) -> None:
@@ -128,19 +132,24 @@ def _chunks(stream: ByteSource, name: str) -> Iterator[bytes]:
             raise InputError(
                 f"{name}: must be readable to its end, found: {error or type(error).__name__}."
             ) from error
-        if not isinstance(chunk, bytes):
+        if chunk is None:
+            raise InputError(f"{name}: must be open in blocking mode, found no bytes yet.")
+        if not isinstance(chunk, bytes | bytearray | memoryview):
             raise _not_binary(name)
         if not chunk:
             return
-        yield chunk
+        yield bytes(chunk)
 
 
 @contextmanager
 def written_to(stream: ByteSink) -> Iterator[BinaryIO]:
     """Open a seekable file, and copy it to a stream when it is complete."""
     with SpooledTemporaryFile(max_size=MEMORY_BYTES) as file:
-        yield cast(BinaryIO, file)
-        file.seek(0)
+        try:
+            yield cast(BinaryIO, file)
+            file.seek(0)
+        except OSError as error:
+            raise _no_room(f"of what {name_of(stream)} gets", error) from error
         try:
             copy_to(stream, cast(BinaryIO, file))
             getattr(stream, "flush", lambda: None)()

@@ -57,13 +57,14 @@ def _extent(arrays: Arrays) -> Float[np.ndarray, "2 3"]:
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for start in range(0, len(arrays.means), _CHUNK_ROWS):
         part = slice(start, start + _CHUNK_ROWS)
-        scales = torch.from_numpy(np.exp(arrays.log_scales[part].astype(np.float64)))
+        scales = torch.from_numpy(scales_of(arrays.log_scales[part]).astype(np.float64))
         quats = torch.from_numpy(arrays.quats[part].astype(np.float64))
         variances = build_covariances(scales, quats).diagonal(dim1=1, dim2=2).numpy()
         reach = _SIGMAS * np.sqrt(variances)
         low = np.minimum(low, (arrays.means[part] - reach).min(axis=0))
         high = np.maximum(high, (arrays.means[part] + reach).max(axis=0))
-    return np.stack([low, high])
+    most = float(np.finfo(np.float32).max)
+    return np.stack([low, high]).clip(-most, most)
 
 
 def _quoted(text: str) -> str:

@@ -127,6 +127,7 @@ _Cut = int | tuple["_Cut", "_Cut"]
 
 
 @on_host()
+@torch.no_grad()
 def plan_stream(
     levels: Sequence[StreamedLevel],
     *,
@@ -283,7 +284,7 @@ def _widest(points: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
 
 def _rows(labels: Int[Tensor, "m"], scene: GaussianScene, count: int) -> list[Int[Tensor, "k"]]:
     """Return the rows of every chunk, along a Morton curve of the whole level."""
-    curve = torch.from_numpy(morton_rows(scene.means.cpu().float().numpy()))
+    curve = torch.from_numpy(morton_rows(scene.means.detach().cpu().float().numpy()))
     curve = curve[labels[curve] >= 0]
     order = curve[torch.sort(labels[curve], stable=True).indices]
     sizes = torch.bincount(labels[curve], minlength=count).tolist()

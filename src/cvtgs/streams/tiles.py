@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -81,7 +82,7 @@ class TilesFormat:
             local = some.with_tensors({name: one.float() for name, one in tensors.items()})
             turned = change_axes(local, SCENE_AXES, AXES)
             path = folder / names[id(tile)]
-            with atomic_output(path, overwrite=True) as file:
+            with np.errstate(over="ignore"), atomic_output(path, overwrite=True) as file:
                 write_spz_glb(turned, file)
             dropped.update(dropped_within(turned, FORMAT_LIMITS[".spz.glb"]))
             counts[tile.level] += len(rows)

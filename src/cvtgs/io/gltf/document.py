@@ -132,8 +132,9 @@ class GltfFile:
     binary: bytes | None = None
     """The binary chunk of a ``.glb``."""
     stored: int
-    """Bytes of the file on disk, plus those read so far from buffers beside it."""
-    _buffers: dict[int, bytes] = field(default_factory=dict)
+    """Bytes of the file on disk, plus those read so far from files beside it, each once."""
+    _buffers: dict[int, memoryview] = field(default_factory=dict)
+    _beside: dict[Path, bytes] = field(default_factory=dict)
 
     def entry(self, model: type[AnyDocument], name: str, index: int) -> AnyDocument:
         """Return a checked entry of a list of the document."""
@@ -156,7 +157,7 @@ class GltfFile:
                 f"bufferViews[{index}] must end within buffer {view.buffer} of {len(content):,} "
                 f"bytes, found byte {end:,}"
             )
-        return memoryview(content)[view.byteOffset : end], view.byteStride
+        return content[view.byteOffset : end], view.byteStride
 
     def values(self, index: int, kind: str, name: str) -> NDArray[np.float32]:
         """Return the numbers of an accessor as float32, one row per element."""
@@ -205,7 +206,7 @@ class GltfFile:
             np.maximum(numbers, -1, out=numbers)
         return numbers
 
-    def _buffer(self, index: int) -> bytes:
+    def _buffer(self, index: int) -> memoryview:
         if index in self._buffers:
             return self._buffers[index]
         buffer = self.entry(_Buffer, "buffers", index)
@@ -217,12 +218,12 @@ class GltfFile:
         elif buffer.uri.startswith("data:"):
             content = self._decoded(buffer.uri, index)
         else:
-            content = self._beside(buffer.uri, index, buffer.byteLength)
+            content = self._read_beside(buffer.uri, index)
         if len(content) < buffer.byteLength:
             raise self.error(
                 f"buffers[{index}] must have {buffer.byteLength:,} bytes, found {len(content):,}"
             )
-        self._buffers[index] = content[: buffer.byteLength]
+        self._buffers[index] = memoryview(content)[: buffer.byteLength]
         return self._buffers[index]
 
     def _decoded(self, uri: str, index: int) -> bytes:
@@ -234,16 +235,20 @@ class GltfFile:
         except ValueError as error:  # also binascii.Error
             raise self.error(f"buffers[{index}] must be valid base64, found: {error}") from error
 
-    def _beside(self, uri: str, index: int, length: int) -> bytes:
+    def _read_beside(self, uri: str, index: int) -> bytes:
+        """Read a file once, however many buffers it is."""
         name = unquote(uri)
         if not is_within(name) or len(name) > LONGEST_NAME:  # such as a damaged data URI
             raise self.error(
                 f"buffers[{index}] must be in the folder of the file, found {shown(uri)}"
             )
-        with open_input(self.path.parent / PurePosixPath(name)) as file:
-            content = file.read(length)
-        self.stored += len(content)
-        return content
+        path = self.path.parent / PurePosixPath(name)
+        with open_input(path) as file:
+            place = path.resolve()
+            if place not in self._beside:
+                self._beside[place] = file.read()
+                self.stored += len(self._beside[place])
+        return self._beside[place]
 
 
 def open_gltf(path: Path) -> GltfFile:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from cvtgs.edit import Motion, concatenate, move
-from cvtgs.errors import DroppedDataWarning, warn
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn
 from cvtgs.io.arrays import Arrays, log_scales_of, logits_of, scene_of, unit_quats
 from cvtgs.io.axes import SCENE_AXES, change_axes
 from cvtgs.io.files import (
@@ -177,7 +177,8 @@ def _placed_meshes(file: GltfFile) -> Iterator[tuple[int, Matrix]]:
             raise file.error(f"each node must occur once in the hierarchy, found {index} again")
         seen.add(index)
         node = file.entry(_Node, "nodes", index)
-        matrix = above @ _local_matrix(node)
+        with np.errstate(all="ignore"):  # numbers beyond float64 are refused where they are used
+            matrix = above @ _local_matrix(node)
         if node.mesh is not None:
             yield node.mesh, matrix
         waiting += [(child, matrix) for child in reversed(node.children)]
@@ -187,8 +188,9 @@ def _local_matrix(node: _Node) -> Matrix:
     if node.matrix is not None:
         return np.array(node.matrix, np.float64).reshape(4, 4).T
     x, y, z, w = node.rotation
-    matrix = np.eye(4)
+    matrix, length = np.eye(4), math.hypot(x, y, z, w)
     quat = torch.tensor([[w, x, y, z]], dtype=torch.float64, device="cpu")
+    quat /= length if 0 < length < math.inf else 1.0
     matrix[:3, :3] = quats_to_matrices(quat)[0].numpy() * node.scale
     matrix[:3, 3] = node.translation
     return matrix
@@ -211,6 +213,8 @@ def _size(file: GltfFile, one: _Splats) -> tuple[int, int]:
         header = peek_spz(*packed)
         return header.count, header.sh_degree
     position = file.entry(Accessor, "accessors", _index(file, one, POSITION))
+    if position.bufferView is not None:
+        file.view(position.bufferView)  # so that the bytes of a file beside it count
     return position.count, _degree(file, one)
 
 
@@ -266,6 +270,8 @@ def _read_attributes(file: GltfFile, one: _Splats) -> GaussianScene:
             f"(a draft of the extension, which splat-transform 2.3 wrote, stored logarithms)"
         )
     opacities = rows(OPACITY, "SCALAR")[:, 0]
+    if any(name in one.primitive.attributes for name in coefficients(len(REST_COUNTS))):
+        warn(f"{file.path}: left out SH coefficients above degree 3.", DroppedDataWarning)
     bands = range(1, 1 + _degree(file, one))
     rest = [rows(name, "VEC3") for band in bands for name in coefficients(band)]
     return scene_of(
@@ -330,4 +336,8 @@ def _moved(file: GltfFile, scene: GaussianScene, matrix: Matrix) -> GaussianScen
         )
     w, a, b, c = matrices_to_quats(torch.from_numpy(rotation)[None])[0].tolist()
     x, y, z = matrix[:3, 3].tolist()
-    return move(scene, Motion(quat=(w, a, b, c), scale=scale, shift=(x, y, z)))
+    motion = Motion(quat=(w, a, b, c), scale=scale, shift=(x, y, z))
+    try:
+        return move(scene, motion)
+    except InvalidArgumentError as error:
+        raise file.error(f"a node moves Gaussians too far: {str(error).rstrip('.')}") from error

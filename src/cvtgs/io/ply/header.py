@@ -325,11 +325,12 @@ def check_size(header: Header, table: Element, *, path: str, size: int) -> None:
 def layout_of(vertex: Element) -> Layout:
     """Return the layout that a scene keeps and will be written with.
 
-    Lists are left out. Standard properties that the file stores as integers become ``float``,
-    since merged values are not whole numbers.
+    Lists are left out. Standard properties that the file stores as integers become floats of the
+    precision of the scene, since merged values are not whole numbers.
     """
+    float_type = "double" if dtype_of(vertex.columns) == torch.float64 else "float"
     return tuple(
-        (name, "float" if is_standard(name) and kind not in FLOAT_TYPES else kind)
+        (name, float_type if is_standard(name) and kind not in FLOAT_TYPES else kind)
         for name, kind in vertex.columns
     )
 

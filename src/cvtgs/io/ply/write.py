@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvtgs.errors import DroppedDataWarning, FileFormatError, InvalidSceneError, warn
+from cvtgs.errors import FileFormatError, InvalidSceneError
 from cvtgs.io.ply.header import (
     FLOAT_TYPES,
     MAX_NAME_LETTERS,
@@ -26,7 +26,7 @@ from cvtgs.io.ply.header import (
 )
 from cvtgs.io.ply.read import open_rows
 from cvtgs.scene import FLAT_LOG_SCALE, NORMALS, GaussianScene
-from cvtgs.text import shown
+from cvtgs.text import counted, shown
 
 CHUNK_BYTES = 1 << 20  # bytes that are gathered before they are written
 
@@ -48,7 +48,6 @@ def write_ply(scene: GaussianScene, file: BinaryIO) -> None:
     if len(scene) == 0:
         raise InvalidSceneError("a scene must hold at least one Gaussian to be written, found 0.")
     layout = _output_layout(scene)
-    _warn_of_flattened(scene, layout)
     file.write(header_bytes(scene.comments, [("vertex", len(scene), layout)]))
     dtype = row_dtype(layout)
     rows = max(1, CHUNK_BYTES // dtype.itemsize)
@@ -96,16 +95,15 @@ def _rows(tensor: Tensor, start: int, stop: int) -> NDArray[Any]:
     return array
 
 
-def _warn_of_flattened(scene: GaussianScene, layout: Layout) -> None:
-    if "scale_2" in dict(layout):
-        return
+def lost_scales(scene: GaussianScene) -> str:
+    """Return a phrase for third scales that the layout of a scene has no column for, or ""."""
     thick = int((scene.log_scales[:, 2] != FLAT_LOG_SCALE).sum())
-    if thick:
-        warn(
-            f"the third scale of {thick:,} Gaussians was left out, since the file that the scene "
-            f"came from has no scale_2 (2DGS).",
-            DroppedDataWarning,
-        )
+    if not scene.layout or "scale_2" in dict(scene.layout) or not thick:
+        return ""
+    return (
+        f"the third scale of {counted(thick, 'Gaussian')}, since the file that the scene came from "
+        f"has no scale_2 (2DGS)"
+    )
 
 
 def _output_layout(scene: GaussianScene) -> Layout:

@@ -178,10 +178,11 @@ def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
             sh0=_decoded(meta.colors, colors),
             shN=_rest(images, meta),
         )
-    if document.model == "2dgs":
-        return replace(scene_of(arrays), comments=(TWO_SCALES.text,))
     antialiased = document.model == "antialiased" or document.antialias is True
-    return scene_of(arrays, antialiased=antialiased)
+    scene = scene_of(arrays, antialiased=antialiased)
+    if document.model == "2dgs":
+        return replace(scene, comments=(*scene.comments, TWO_SCALES.text))
+    return scene
 
 
 def _check_expansion(meta: _Meta, path: Path) -> None:
