@@ -11,8 +11,6 @@ import torch
 import mergenet_oracle as oracle
 from cvtgs import GaussianScene
 from cvtgs.cells.descriptors import (
-    AREA,
-    AREA_SCALE,
     CELL_FEATURES,
     LEAST_PIXELS,
     MEMBER_FEATURES,
@@ -21,7 +19,6 @@ from cvtgs.cells.descriptors import (
 )
 from cvtgs.mergenet import Architecture, KnownRange, MergeNet, Residuals
 from cvtgs.mergenet.model import (
-    LEAST_AREA,
     MARGIN,
     MEMBERS,
     NARROWEST,
@@ -344,21 +341,6 @@ def test_cells_that_are_far_too_small_for_images_stay_unchanged():
     assert 0.4 < half / whole < 0.6
     assert 0.05 < tenth / whole < 0.15
     assert none == [0.0, 0.0]
-
-
-def test_neighbours_that_are_far_smaller_lend_no_colour():
-    """What they lend fades out over a factor of e in area; they still move and turn the cell."""
-    seen, net = some_case().describe(), MergeNet(Architecture()).double()
-    pairs = seen.pairs.clone()
-    pairs[:, :4, AREA] = AREA_SCALE * (LEAST_AREA + torch.tensor([-5.0, 0.0, 0.25, 1.0]))
-    pairs[:, 4:, AREA] = AREA_SCALE * torch.tensor([0.0, 3.0, 9.0, 14.0])
-    with torch.no_grad():
-        net.pair_gates.gates.bias[:] = 1.0
-        found = net(replace(seen, pairs=pairs))
-    wanted = torch.tensor([0.0, 0.0, 0.25, 1.0, 1.0, 1.0, 1.0, 1.0]).double()
-    whole = 0.5 / 8 * math.tanh(1.0)
-    torch.testing.assert_close(found.pair_colors, whole * wanted.expand(len(seen), 8))
-    assert bool(found.d_means.any())
 
 
 def test_training_cells_keep_their_residuals():

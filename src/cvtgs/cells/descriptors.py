@@ -14,6 +14,10 @@ from cvtgs.text import short_repr
 MEMBER_FEATURES = 19  # number of features of a member relative to its cell
 PAIR_FEATURES = 18  # number of features of a neighbour relative to a cell
 CELL_FEATURES = 21  # number of features of a cell itself
+DISTANCE, DISTANCE_BACK = 3, 11
+"""Indices of the features of a neighbour that are ``log(1 + d)`` of its distance in standard
+deviations of the cell, and in its own."""
+
 AREA, AREA_SCALE = 13, 0.2
 """Index of the feature of a neighbour that is the logarithm of its mean projected area relative to
 that of the cell, and its factor."""

@@ -17,6 +17,8 @@ from cvtgs.cells.descriptors import (
     AREA,
     AREA_SCALE,
     CELL_FEATURES,
+    DISTANCE,
+    DISTANCE_BACK,
     LEAST_PIXELS,
     MEMBER_FEATURES,
     PAIR_FEATURES,
@@ -41,6 +43,11 @@ LARGEST_PAIR_GATE = 0.5
 LEAST_AREA = -4.5
 """Logarithm of the ratio of areas up to which a neighbour is too small to lend its colour; from 1
 above it, it lends all. A cell of the sky has much smaller ones far in front of it as neighbours."""
+
+FARTHEST = 10.0
+"""Distance from which on a neighbour lends no colour, in standard deviations of the cell or of the
+neighbour, whichever are fewer; up to 1 less, it lends all. Few walls of a room have the object in
+front of them among their nearest cells."""
 
 SUMMARY_FEATURES = CELL_FEATURES - 1 + MEMBER_FEATURES + PAIR_FEATURES
 """Number of features that decide whether a cell is similar to the training cells."""
@@ -214,7 +221,9 @@ class MergeNet(CellNetwork):
         pixels = descriptors.cells[:, -1] / PIXEL_SCALE
         known = self.known(summarize(descriptors)) * (pixels - (LEAST_PIXELS - 1)).clamp(0, 1)
         by_cell = known[:, None]
-        lends = (descriptors.pairs[:, :, AREA] / AREA_SCALE - LEAST_AREA).clamp(0, 1)
+        areas = descriptors.pairs[:, :, AREA] / AREA_SCALE
+        distances = descriptors.pairs[:, :, [DISTANCE, DISTANCE_BACK]].amin(dim=2).expm1()
+        lends = (areas - LEAST_AREA).clamp(0, 1) * (FARTHEST - distances).clamp(0, 1)
         return Residuals(
             d_means=(pulls[:, :3] + others[:, :3]) * by_cell,
             d_log_scales=self.architecture.largest_growth * torch.tanh(sizes[:, :3]) * by_cell,
