@@ -332,3 +332,15 @@ def test_small_scales_of_view_matrices_are_no_rounding() -> None:
     scales = view_scales(viewmats)
     assert scales[0] == 1.0
     torch.testing.assert_close(scales[1:], torch.tensor([1.002, 0.998]))
+
+
+@pytest.mark.parametrize("digits", [4, 6])
+def test_centres_are_where_renderers_put_cameras_with_rounded_rotations(digits: int) -> None:
+    """Far from the origin, the transpose of a rounded rotation is the inverse of none."""
+    eyes = torch.tensor([[500_000.0, 4_000_000.0, 100.0]], dtype=torch.float64)
+    target = eyes + torch.tensor([[1.0, 2.0, 0.5]], dtype=torch.float64)
+    viewmats = look_at(eyes, target, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    viewmats[:, :3, :3] = viewmats[:, :3, :3].round(decimals=digits)
+    viewmats[:, :3, 3] = -(viewmats[:, :3, :3] @ eyes[:, :, None])[:, :, 0]
+    cameras = Cameras(viewmats=viewmats, Ks=torch.eye(3)[None].double(), width=8, height=8)
+    torch.testing.assert_close(cameras.centers, eyes, rtol=0, atol=1e-6)

@@ -94,10 +94,10 @@ class Cameras:
     @property
     @without_autocast()
     def centers(self) -> Float[Tensor, "c 3"]:
-        """Positions of the cameras in the world."""
+        """Positions of the cameras in the world, where renderers put them."""
         rotations, shifts = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3:]
-        centers = -(rotations.transpose(1, 2) @ shifts)[:, :, 0]
-        return centers / view_scales(self.viewmats)[:, None].square()
+        found: Tensor = torch.linalg.solve_ex(rotations, -shifts).result
+        return found[:, :, 0]
 
     def select(self, rows: Rows) -> Self:
         """Return some of the cameras, as ``cameras[rows]`` does.

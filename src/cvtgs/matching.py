@@ -368,8 +368,8 @@ def with_deeper_opacities(small: GaussianScene, factors: Float[Tensor, "m"]) -> 
 
 
 def heldout_views(views: ObservedViews) -> ObservedViews:
-    """Return every eighth view that shows something, or all views if there are fewer."""
-    held = heldout_rows(views.alpha) or range(len(views.cameras))
+    """Return every eighth view that shows something, or all of these if there are fewer."""
+    held = heldout_rows(views.alpha) or showing_rows(views.alpha)
     rows = torch.tensor(held, device="cpu")
     cameras = views.cameras.select(rows)
     return replace(views, cameras=cameras, rgb=views.rgb[rows], alpha=views.alpha[rows])

@@ -236,7 +236,7 @@ class Prepared:
         if self._cameras is not None and self._config.uses_images and not is_whole:
             from cvtgs.evaluation.blind_views import check_seen  # noqa: PLC0415 (few give cameras)
 
-            check_seen(valid, self._cameras, name="the scene")
+            check_seen(valid, self._cameras, name="the scene", refines=self._config.refine.enabled)
         with clock.stage("plan"):
             sees = self._net is not None and self._net.sees_surroundings
             analysis = analyze(valid, self._config, with_visibility=sees and not is_whole)

@@ -6,10 +6,13 @@ import warnings
 import pytest
 import torch
 
-from cvtgs import Cameras, GaussianScene, Simplifier, evaluate
+from cvtgs import Cameras, GaussianScene, Simplifier, SimplifyConfig, evaluate, refine
 from cvtgs.budget import find_count
-from cvtgs.errors import InvalidSceneError
+from cvtgs.config import MatchConfig, RefineConfig
+from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.evaluation import EvaluationSettings, compare
+from cvtgs.matching import match_views
+from cvtgs.rendering import observe
 from cvtgs.synthetic import scene as make
 from cvtgs.views import automatic_views
 
@@ -88,3 +91,36 @@ def test_a_scene_without_gaussians_is_refused(scene, score):
     good, _ = views_of(scene, 0)
     with pytest.raises(InvalidSceneError, match="full must have at least one Gaussian, found no"):
         score(scene[:0], {"small": scene}, good)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_refinement_needs_two_cameras_that_see_the_scene(scene, small, first):
+    """The held-out one of two would be perfect from the start, or the other teach nothing."""
+    good, both = views_of(scene, 1)
+    rows = [[0, 1], [1, 0]][first]
+    text = "at least 2 cameras that see {}, one of them to be held out; found 1 of 2"
+    with pytest.raises(InvalidArgumentError, match=text.format("the full scene")):
+        refine(small, scene, cameras=both[rows], config=RefineConfig(steps=1))
+    config = SimplifyConfig(refine=RefineConfig(steps=1))
+    with pytest.raises(InvalidArgumentError, match=text.format("the scene")):
+        Simplifier(config=config, device="cpu").run(scene, 0.1, cameras=both[rows])
+    report = refine(small, scene, cameras=good[:2], config=RefineConfig(steps=1)).report
+    assert report.stopped != "perfect"
+
+
+@pytest.mark.parametrize("seeing", [1, 2])
+def test_images_of_nothing_do_not_decide_in_matching(scene, small, seeing):
+    good, _ = views_of(scene, 0)
+    away = TURNED.to(good.viewmats) @ good.viewmats.repeat(2, 1, 1)
+    viewmats = torch.cat([good.viewmats[:seeing], away])
+    both = Cameras(
+        viewmats=viewmats, Ks=good.Ks[:1].repeat(len(viewmats), 1, 1), width=48, height=36
+    )
+    config = MatchConfig(opacity_rounds=0, color_iterations=5)
+    targets = torch.zeros(len(small))
+    alone = match_views(small, observe(scene, good[:seeing]), targets, config=config)
+    found = match_views(small, observe(scene, both), targets, config=config)
+    assert found.report.heldout == seeing
+    assert found.report.psnr_before == pytest.approx(alone.report.psnr_before)
+    assert found.report.psnr_after == pytest.approx(alone.report.psnr_after)
+    assert found.report.psnr_after > found.report.psnr_before

@@ -1,5 +1,6 @@
 """Contributions and blending weights: sums over images, and how presets use them."""
 
+import math
 import re
 import warnings
 
@@ -12,9 +13,11 @@ from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.analysis import analyze
 from cvtgs.analysis.analyze import measure_contributions
 from cvtgs.cameras import Cameras, look_at
+from cvtgs.config import MatchConfig
 from cvtgs.edit import Motion, move
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation.blind_views import check_seen
+from cvtgs.matching import fit_colors
 from cvtgs.rendering import blending_weights, contributions, error_shares, observe, render
 from cvtgs.synthetic import demo_scene
 from cvtgs.views import automatic_views, mixed_views
@@ -310,3 +313,24 @@ def test_weights_take_colours_and_images_of_any_dtype(backend, dtype):
     assert torch.allclose(image.double(), weights.paint(colors.double()).double(), atol=1e-6)
     collected, normal = weights.collect(image.to(dtype)), weights.normal(colors)
     assert torch.allclose(collected.double(), normal.double(), atol=1e-4)
+
+
+@backends
+def test_gaussians_with_invalid_bands_paint_nothing(backend):
+    """Contributions and weights, too, which are of the constant band alone."""
+    scene, cameras = random_scene(60, degree=1), around(1)
+    shN = scene.shN.clone()  # noqa: N806
+    shN[::2, 1, 0] = math.nan
+    scene = scene.with_tensors(shN=shN)
+    drawn = render(scene, cameras, backend=backend).alpha.sum().double()
+    assert float(drawn) > 1.0
+    for found in (
+        contributions(scene, cameras, backend=backend),
+        observe(scene, cameras, backend=backend).contributions,
+        blending_weights(scene, cameras, backend=backend).powers()[:, 0].double(),
+    ):
+        assert not bool(found[::2].any())
+        torch.testing.assert_close(found.sum(), drawn, rtol=1e-4, atol=0)
+    config = MatchConfig(color_iterations=3)
+    fitted = fit_colors(scene[1:6], observe(scene, cameras, backend=backend), config=config)
+    assert bool(fitted.sh0.isfinite().all())

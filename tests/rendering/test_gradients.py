@@ -199,3 +199,13 @@ def test_gradients_cannot_be_differentiated(backend):
         torch.autograd.grad(gradient.square().sum(), leaf, retain_graph=True)
     with pytest.raises(InvalidArgumentError, match="first derivatives only"):
         (image.mean() + gradient.square().sum()).backward()
+
+
+@backends
+@pytest.mark.parametrize("degree", [0, 2])
+def test_unused_bands_have_gradients_of_zero(backend, degree):
+    scene = random_scene(20, degree=degree)
+    bands = scene.shN.clone().requires_grad_()
+    image = render(scene.with_tensors(shN=bands), TWO, backend=backend, sh_degree=0).rgb
+    (found,) = torch.autograd.grad(image.sum(), bands)
+    assert torch.equal(found, torch.zeros_like(bands))

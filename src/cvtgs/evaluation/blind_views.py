@@ -26,11 +26,13 @@ def check_seen(
     name: str,
     backend: BackendName = "auto",
     is_sample: bool = False,
+    refines: bool = False,
 ) -> None:
-    """Raise if no camera sees anything of a scene, or one is no pinhole camera.
+    """Raise if too few cameras see anything of a scene, or one is no pinhole camera.
 
-    Warn if few see anything, or if the near plane hides much. A sample of a scene cannot tell that
-    a camera sees nothing, so there is no warning of that.
+    A refinement needs two, otherwise one is enough. Warn if few see anything, or if the near plane
+    hides much. A sample of a scene cannot tell that a camera sees nothing, so there is no warning
+    of that.
     """
     if len(scene) == 0:
         raise InvalidSceneError(f"{name} must have at least one Gaussian, found none.")
@@ -47,7 +49,8 @@ def check_seen(
     for some in (points[:: -(-len(points) // SAMPLED)].cpu(), points):  # all only in doubt
         exact = some.double()
         blind = [camera for camera in blind if not camera.shows_any(exact)]
-        if 2 * len(blind) <= len(cameras):
+        seeing = len(cameras) - len(blind)
+        if seeing >= max(len(blind), 2 if refines else 1):
             return
     images = (render_views(scene, camera.fitted(PREVIEW), backend=backend) for camera in blind)
     # Gaussians beside an image may reach into it
@@ -56,6 +59,11 @@ def check_seen(
         raise InvalidArgumentError(
             f"the cameras must see {name}, found nothing of it in any of {len(cameras)} "
             f"views; give cameras of this scene, in its axes and units."
+        )
+    if refines and empty == len(cameras) - 1 and not is_sample:
+        raise InvalidArgumentError(
+            f"a refinement needs at least 2 cameras that see {name}, one of them to be held out; "
+            f"found 1 of {len(cameras)}."
         )
     if 2 * empty > len(cameras) and not is_sample:
         warn(

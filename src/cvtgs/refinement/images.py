@@ -83,7 +83,8 @@ def shared_views(
     rgb, alpha = observed.rgb.to(full.device), observed.alpha.to(full.device)
     whole = ViewImages(cameras=observed.cameras, rgb=rgb, alpha=alpha)
     images = [whole.select(row) for row in range(len(observed.cameras))]
-    held = _heldout_rows(showing_rows(alpha), config)
+    showing = showing_rows(alpha)
+    held = _heldout_rows(showing if len(showing) > 1 else range(len(alpha)), config)
     further = _further(observed.cameras, full, cameras, config=config, seed=seed)
     return RefineViews(
         heldout=(),

@@ -186,7 +186,7 @@ def _refine_on(  # noqa: PLR0913 (options by name)
     limits = deepcopy(limits)
     ours, theirs = _on_device(small, full, place)
     if cameras is not None:
-        check_seen(theirs, cameras, name="the full scene")
+        check_seen(theirs, cameras, name="the full scene", refines=True)
     clock = StageClock(listener, place)
     # The program may have disabled gradients, or be in inference mode or autocast.
     with (

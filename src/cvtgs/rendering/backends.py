@@ -198,6 +198,16 @@ def check_image(image: Tensor, size: tuple[int, int]) -> None:
     check_kinds({"image": Float[Tensor, f"{size[1]} {size[0]} 3"]}, {"image": image})
 
 
+def without_invalid_colors(scene: GaussianScene) -> GaussianScene:
+    """Let Gaussians with view-dependent colours that are not finite draw nothing, in any degree."""
+    if scene.sh_degree == 0:
+        return scene
+    valid = scene.shN.isfinite().flatten(1).all(dim=1)
+    if scene.device.type == "cpu" and bool(valid.all()):
+        return scene  # elsewhere, the host would wait to learn this
+    return scene.with_tensors(logit_opacities=scene.logit_opacities.where(valid, torch.nan))
+
+
 def without_gradients(scene: GaussianScene) -> GaussianScene:
     """Return a scene of constants that autograd takes, also in inference mode."""
     with torch.inference_mode(mode=False):

@@ -322,6 +322,8 @@ def _colors(
     # In float32, squares of more than 1e19 units are infinite.
     exact = torch.nn.functional.normalize(offsets.double(), dim=1) if count else offsets
     colors = spherical_harmonics.evaluate(sh0, shN, exact.to(offsets.dtype))
+    if not count and shN.requires_grad:  # so that unused bands have a gradient, of zero
+        colors = colors + shN.flatten(1).sum(dim=1, keepdim=True)
     is_small = rows_are_finite(colors)
     return colors.where(is_small[:, None], 0), finite & is_small
 

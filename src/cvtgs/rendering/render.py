@@ -21,6 +21,7 @@ from cvtgs.rendering.backends import (
     choose_backend,
     differentiable_once,
     without_gradients,
+    without_invalid_colors,
 )
 from cvtgs.scene import GaussianScene, SceneLike, as_scene, check_scene
 from cvtgs.text import counted, short_repr, shown
@@ -180,7 +181,7 @@ def contributions_to_each(
 ) -> Iterator[Float[Tensor, "n"]]:
     """Yield what :func:`contributions` adds up: the contributions to every single image."""
     chosen = choose_backend(backend, scene.device)[1]
-    return chosen.contributions(scene, checked_cameras(cameras))
+    return chosen.contributions(without_invalid_colors(scene), checked_cameras(cameras))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -205,12 +206,12 @@ class ObservedViews:
 
 
 def showing_rows(alpha: Float[Tensor, "c h w"]) -> Sequence[int]:
-    """Return the rows of images that show something; all if fewer than two do.
+    """Return the rows of images that show something; all if none does.
 
     An image of nothing would look perfect from the start, so it must not decide on a result.
     """
     found: list[int] = (alpha.flatten(1).mean(dim=1) >= LEAST_COVER).nonzero()[:, 0].tolist()
-    return found if len(found) > 1 else range(len(alpha))
+    return found or range(len(alpha))
 
 
 def check_observed(views: object, name: str) -> None:
@@ -263,7 +264,8 @@ def observe(
     name, chosen = choose_backend(backend, scene.device)
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
     outputs = []
-    for output, found in chosen.observe(scene, cameras, sh_degree=scene.sh_degree):
+    drawn = without_invalid_colors(scene)
+    for output, found in chosen.observe(drawn, cameras, sh_degree=scene.sh_degree):
         total += found
         outputs.append(output)
         on_image(len(outputs))
@@ -362,7 +364,7 @@ def blending_weights(
     if len(checked_cameras(camera)) != 1:
         raise InvalidArgumentError(f"camera must be a single camera, found {len(camera)}.")
     chosen = choose_backend(backend, scene.device)[1]
-    return chosen.blending_weights(scene, camera)
+    return chosen.blending_weights(without_invalid_colors(scene), camera)
 
 
 def _degree(scene: GaussianScene, sh_degree: int | None) -> int:
