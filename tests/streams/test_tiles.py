@@ -40,10 +40,10 @@ def placed(folder: Path) -> Iterator[tuple[dict[str, Any], Tensor]]:
 
 
 def test_flyaways_are_clamped_without_warnings_of_numpy(tmp_path: Path) -> None:
-    scene = make("object", 400, sh_degree=1, seed=0)
+    scene = make("object", 3000, sh_degree=1, seed=0)
     means = scene.means.clone()
     means[0] = 1e38
-    levels = FAST.levels(scene.with_tensors(means=means), [0.5])
+    levels = FAST.levels(scene.with_tensors(means=means), [1.0, 0.5])
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         warnings.simplefilter("ignore", DroppedDataWarning)
