@@ -7,7 +7,7 @@ import time
 
 import torch
 
-from cvtgs.errors import InputError, InvalidSceneError
+from cvtgs.errors import DroppedDataWarning, InputError, InvalidSceneError, warn
 
 
 def numbered(number: int) -> tuple[int, int, int]:
@@ -16,6 +16,11 @@ def numbered(number: int) -> tuple[int, int, int]:
 
 def refuse(number: int) -> None:
     raise InvalidSceneError(f"{number}: found none.")
+
+
+def caution(number: int) -> int:
+    warn("left out one.", DroppedDataWarning)
+    return number
 
 
 class TwoWordsError(Exception):

@@ -13,6 +13,7 @@ from cvtgs.devices import (
     chosen_device,
     chunk_length,
     device_name,
+    in_chunks,
     move_together,
     usable_device,
     within_memory,
@@ -181,3 +182,16 @@ def test_names_of_devices(monkeypatch):
 
     monkeypatch.setattr(Path, "read_text", refuse)
     assert device_name(torch.device("cpu")) == (platform.processor() or platform.machine())
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_threads_take_tensors_of_inference_mode():
+    """They were made in the thread of the caller."""
+    with torch.inference_mode():
+        sums = torch.zeros(8)
+
+        def add(part: slice) -> None:
+            sums[part] += 1.0
+
+        in_chunks(add, 8, 2, torch.device("cpu"))
+    assert bool((sums == 1).all())

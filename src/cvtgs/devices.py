@@ -8,7 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TypeVar
@@ -254,11 +254,16 @@ def _in_pool(
     function: Callable[[Item], Result], items: Iterable[Item], threads: int
 ) -> Iterator[Result]:
     has_gradients, workers = torch.is_grad_enabled(), min(threads, MOST_THREADS)
+    is_inference = torch.is_inference_mode_enabled()
 
     def start(before: int) -> None:
         _OWN.is_limited, _OWN.spare = True, -(-threads // workers)
         _limit_own(before)
         torch.set_grad_enabled(has_gradients)
+
+    def call(item: Item) -> Result:
+        with torch.inference_mode() if is_inference else nullcontext():  # also of its own thread
+            return function(item)
 
     waiting: deque[Future[Result]] = deque()
     with (
@@ -267,7 +272,7 @@ def _in_pool(
     ):
         try:
             for item in items:
-                waiting.append(pool.submit(function, item))
+                waiting.append(pool.submit(call, item))
                 if len(waiting) > 2 * workers:  # limits the number of pending results
                     yield waiting.popleft().result()
             while waiting:

@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
@@ -20,7 +21,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Protocol, Self, TypeVar, runtime_checkable
 
 from cvtgs.counts import checked_whole
-from cvtgs.errors import InvalidArgumentError, OutputError, RunError, reason_of
+from cvtgs.errors import InvalidArgumentError, OutputError, RunError, reason_of, warn
 from cvtgs.startup import load_torch
 
 if sys.platform == "win32":
@@ -38,6 +39,9 @@ MOST_SENT = 256
 A pipe takes that much in one piece, so a process that ends never leaves a part of a result in it,
 for whose rest the pool would wait forever.
 """
+
+SAFE_PATH = "PYTHONSAFEPATH"
+"""Variable with which Python imports nothing from the current folder, where any file may lie."""
 
 MOST_ON_WINDOWS = 61  # largest number of processes that a pool of Python has on Windows
 
@@ -105,7 +109,7 @@ class LocalWorkers:
                 "a process of multiprocessing.Pool may not start others; use "
                 "concurrent.futures.ProcessPoolExecutor in its place, or no workers here."
             )
-        self._owner = os.getpid()
+        self._owner, self._warned = os.getpid(), set[str]()
         context = get_context("spawn")  # fork would copy locks that torch's threads hold
         threads = max(1, core_count() // self._count)
         with ExitStack() as stack:
@@ -137,12 +141,13 @@ class LocalWorkers:
             return
         # Results are taken by now, and Ctrl-C in a wait for the pool would leave its processes.
         self._cleanup.close()
+        del self._pool
 
     def _start_processes(self) -> None:
         """Let all processes start, while this one reads the sample."""
         self._starts = list[Future[int]]()
         try:
-            with _interrupts_held():
+            with _interrupts_held(), _safe_path():
                 for _ in range(self._count):
                     self._starts.append(self._pool.submit(os.getpid))
         except BrokenProcessPool as error:
@@ -188,6 +193,10 @@ class LocalWorkers:
                 if answer.error is not None:
                     answer.error.add_note(f"In a worker process:\n{answer.trace}")
                     raise answer.error
+                for category, text in answer.warnings:
+                    if text not in self._warned:  # several processes may have found the same
+                        self._warned.add(text)
+                        warn(text, category)
                 result: Result = answer.result
                 yield result
         except BrokenProcessPool as error:
@@ -229,6 +238,20 @@ def _interrupts_held() -> Iterator[None]:
 
 
 @contextmanager
+def _safe_path() -> Iterator[None]:
+    """Start processes that import nothing from the current folder; spawned ones begin there."""
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SAFE_PATH]
+        else:
+            os.environ[SAFE_PATH] = before
+
+
+@contextmanager
 def _hangup_ignored() -> Iterator[None]:
     """Start processes that ignore the signal of a closed terminal: they end with this one."""
     is_main = threading.current_thread() is threading.main_thread()  # others set no handlers
@@ -243,9 +266,10 @@ def _hangup_ignored() -> Iterator[None]:
 
 
 class _Answer(NamedTuple):
-    """What a call returned or raised."""
+    """What a call returned or raised, and its warnings."""
 
     result: Any = None
+    warnings: tuple[tuple[type[Warning], str], ...] = ()
     error: Exception | None = None
     trace: str = ""
 
@@ -254,7 +278,12 @@ def _call(work: bytes, folder: str) -> bytes | str:
     """Call a pickled function; return its pickled answer, or the path of a file with it."""
     try:
         function, item = pickle.loads(work)  # made by the process that started this one
-        answer = pickle.dumps(_Answer(function(item)))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            result = function(item)
+        found = [one for one in caught if issubclass(one.category, UserWarning)]
+        texts = tuple((one.category, str(one.message)) for one in found)
+        answer = pickle.dumps(_Answer(result, texts))
     except Exception as error:
         answer = _pickled_error(error)
     if len(answer) <= MOST_SENT:

@@ -147,3 +147,13 @@ def test_images_leave_less_memory_for_a_stream_in_one_piece(
     error = capsys.readouterr().err
     assert f"at least {LEAST_BYTES + IMAGE_BYTES:,} (" in error
     assert " MB) with images of the scene; found 600000000." in error
+
+
+def test_a_level_of_a_stream_is_refused_in_blocks_as_in_one_piece(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cvtgs.outofcore.memory.block_count", lambda *_, **__: 4)
+    cvtgs.save(random_scene(100), tmp_path / "in.ply")
+    words = ["simplify", str(tmp_path / "in.ply"), str(tmp_path / "out.ply"), "--rho", "0.5"]
+    assert main([*words, "--lod", "3", "--memory", "1GB"]) == 1
+    assert "lod must be 0 unless for a streamed SOG" in capsys.readouterr().err

@@ -92,7 +92,10 @@ def test_some_options_exclude_each_other(capsys):
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--rho", "0.1", "--time-budget", "0s"], "--time-budget must be above 0, found 0 s."),
+        (
+            ["--rho", "0.1", "--time-budget", "0s"],
+            "--time-budget must be above 0 and finite, found 0 s.",
+        ),
         (["--rho", "0.1", "--recalibrate"], "--recalibrate needs --time-budget."),
         (["--rho", "0.1", "--shipped-rates"], "--shipped-rates needs --time-budget."),
         (
@@ -106,6 +109,10 @@ def test_some_options_exclude_each_other(capsys):
         (
             ["--target-psnr", "30", "--time-budget", "2m"],
             "--time-budget chooses the preset and cannot be used with --target-psnr.",
+        ),
+        (
+            ["--rho", "0.1", "--time-budget", "1e400"],
+            "--time-budget must be above 0 and finite, found inf s.",
         ),
     ],
 )
@@ -313,6 +320,13 @@ def test_several_scenes_measure_the_machine_once(source, tmp_path, measured):
         == 0
     )
     assert measured == [True, False]
+
+
+@pytest.mark.long
+def test_the_machine_is_measured_though_the_first_scene_fails(source, tmp_path, measured):
+    words = ["-o", str(tmp_path / "out"), "--rho", "0.1", "--time-budget", "50s", "--recalibrate"]
+    assert main(["simplify", str(tmp_path / "none.ply"), str(source), *words, "--quiet"]) == 1
+    assert measured[-1]
 
 
 @pytest.mark.usefixtures("measured")

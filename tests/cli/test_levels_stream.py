@@ -105,6 +105,16 @@ def test_a_large_scene_is_streamed_in_blocks(
     assert document["root"]["transform"][12:15] == pytest.approx((4276e3, 639e3, 4672e3), abs=2e3)
 
 
+def test_the_suffix_of_a_scene_in_blocks_may_be_in_capitals(
+    tmp_path: Path, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.ply").rename(tmp_path / "A.PLY")
+    words = [word.replace("a.ply", "A.PLY") for word in words]
+    more = ["--stream", "sog", "--memory", "1GB", "--preset", "matched", "--rho", "0.1"]
+    assert main([*words, *more]) == 0
+    assert "In one piece" not in capsys.readouterr().out
+
+
 def first_bytes(folder: Path) -> int:
     """Return the bytes that a viewer must fetch to show the whole scene at its coarsest level."""
 
@@ -174,6 +184,7 @@ def test_levels_fitted_to_cameras_that_score_are_mentioned(tmp_path, capsys):
         ("matched", ["--axes", "rdf"], True),
         ("matched", given, True),
         ("matched", [*given, *split], False),
+        ("matched", [*given, "--split", "train"], True),
         ("draft", given, False),
     ):
         assert main([*words, "--preset", preset, *more]) == 0

@@ -178,3 +178,13 @@ def test_one_group_is_as_wide_as_the_scene_and_groups_far_apart_are_not():
 @pytest.mark.parametrize("points", [torch.zeros(600, 3), torch.rand(511, 3)])
 def test_few_or_coincident_points_have_no_groups(points):
     assert group_radius(points) == math.inf
+
+
+def test_the_radius_of_groups_does_not_depend_on_the_order_of_rows():
+    generator = torch.Generator().manual_seed(1)
+    points = torch.randn(6000, 3, generator=generator)
+    points[:, 0] += 70.0 * torch.arange(6).repeat_interleave(1000)
+    wanted = group_radius(points)
+    for _ in range(3):
+        order = torch.randperm(6000, generator=generator)
+        assert group_radius(points[order]) == wanted

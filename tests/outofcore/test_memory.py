@@ -150,6 +150,10 @@ def test_the_least_memory_is_accepted_and_less_is_refused() -> None:
         read_bytes(f"{least - 1}MB")
 
 
+def test_more_memory_than_any_machine_has_is_all_of_it() -> None:
+    assert read_bytes("9" * 400) == read_bytes("1" + "0" * 25 + "TB") == sys.maxsize
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("build", "least"), [(None, 400), ("13.0", 550)])
 def test_the_build_of_torch_counts(build: str | None, least: int) -> None:

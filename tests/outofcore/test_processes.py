@@ -21,11 +21,18 @@ import pytest
 import cvtgs
 from cvtgs.cli.main import main
 from cvtgs.devices import core_count
-from cvtgs.errors import InputError, InvalidArgumentError, InvalidSceneError, OutputError, RunError
+from cvtgs.errors import (
+    DroppedDataWarning,
+    InputError,
+    InvalidArgumentError,
+    InvalidSceneError,
+    OutputError,
+    RunError,
+)
 from cvtgs.outofcore import LocalWorkers, simplify_file
 from cvtgs.outofcore.memory import ROOMY_BYTES, worker_count
 from cvtgs.processes import MOST_SENT, _call
-from process_cases import die, fail, miss, numbered, refuse, wait
+from process_cases import caution, die, fail, miss, numbered, refuse, wait
 
 pytestmark = pytest.mark.slow  # every process loads torch
 
@@ -304,6 +311,27 @@ def test_a_wrong_number_of_processes_is_refused(count):
 def test_processes_must_be_started():
     with pytest.raises(InvalidArgumentError, match="workers run inside `with LocalWorkers"):
         next(LocalWorkers(1)(abs, [-1]))
+
+
+def test_processes_that_have_ended_take_no_more_work():
+    with LocalWorkers(1) as workers:
+        pass
+    with pytest.raises(InvalidArgumentError, match="workers run inside `with LocalWorkers"):
+        next(workers(abs, [-1]))
+
+
+def test_warnings_of_workers_reach_the_caller_once(workers):
+    with pytest.warns(DroppedDataWarning) as caught:
+        assert list(workers(caution, range(4))) == [0, 1, 2, 3]
+    assert [str(one.message) for one in caught] == ["left out one."]
+
+
+def test_workers_import_nothing_from_the_current_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "selectors.py").write_text("raise ImportError('of another program')")
+    with LocalWorkers(1) as found:
+        assert list(found(abs, [-1])) == [1]
+    assert "PYTHONSAFEPATH" not in os.environ
 
 
 def test_a_process_that_may_not_start_others_says_so(monkeypatch):

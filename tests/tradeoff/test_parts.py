@@ -264,6 +264,8 @@ def test_presets_and_ratios_are_checked():
         tasks_of(None, [2.0])
     with pytest.raises(InvalidArgumentError, match=r"given once, found standard 0\.1 twice"):
         tasks_of(["standard"], [0.1, 0.10])
+    with pytest.raises(InvalidArgumentError, match=r"given once, found draft 0\.3 twice"):
+        tasks_of(["draft"], [0.3, 0.1 + 0.2])  # their files would have one name
     with pytest.raises(InvalidArgumentError, match="at least one preset and one ratio"):
         tasks_of([], [0.1])
 

@@ -20,3 +20,12 @@ def test_the_start_of_a_run_is_measured_as_the_command_line_starts(monkeypatch):
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     shown = "import os; print(os.environ.get('OMP_WAIT_POLICY'), gc.get_freeze_count() > 0)"
     assert run_process([sys.executable, "-c", START + shown]).output == "PASSIVE True\n"
+
+
+@pytest.mark.parametrize("name", ["selectors", "statistics"])
+def test_processes_import_nothing_from_the_current_folder(tmp_path, monkeypatch, name):
+    """The launcher imports the one, cvtgs the other."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / f"{name}.py").write_text("raise ImportError('of another program')")
+    code = "import selectors, statistics; print('both')"
+    assert run_process([sys.executable, "-c", code]).output == "both\n"

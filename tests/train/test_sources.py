@@ -196,6 +196,7 @@ def test_invalid_rows_of_a_file_are_left_out(tmp_path):
         ({"folders": ["nowhere"]}, "data.folders (--scenes): {0}/nowhere is not a folder."),
         ({"folders": ["."]}, "data.folders (--scenes): {0} holds no PLY file."),
         ({"folders": ["some"], "validation": ("x",)}, "data.validation: no file named x.ply in"),
+        ({"folders": ["some"], "validation": ("x.PLY",)}, "data.validation: no file named x.ply "),
         (
             {"folders": ["some", "some"]},
             "data.folders: 2 scenes would be named a, of {0}/some/",

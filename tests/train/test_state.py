@@ -156,6 +156,17 @@ def test_another_configuration_is_one_clear_error(tmp_path, changes):
     assert state.step == 0
 
 
+def test_a_training_with_a_restart_is_not_told_to_restart(tmp_path):
+    """It cannot go on once more."""
+    restarted = CONFIG.model_copy(update={"steps": 10, "restart_step": 5})
+    path = tmp_path / "a.state"
+    stepped(TrainState(small_net(), restarted), 10).save(path, restarted)
+    longer = restarted.model_copy(update={"steps": 15, "restart_step": 10})
+    with pytest.raises(CheckpointError) as caught:
+        loaded(path, longer)
+    assert str(caught.value).endswith("restore the setting, or train to another output.")
+
+
 def test_note_and_patience_may_change(tmp_path):
     path = saved(tmp_path / "a.state")
     assert loaded(path, CONFIG.model_copy(update={"note": "more", "patience": 3})).step == 3

@@ -1,6 +1,7 @@
 """Goals of ``cvtgs simplify`` besides a count: a time budget, or a quality to reach."""
 
 import argparse
+import math
 import sys
 import time
 from collections.abc import Mapping
@@ -53,8 +54,10 @@ def check_goals(options: argparse.Namespace) -> None:
             if getattr(options, option.replace("-", "_")):
                 raise InvalidArgumentError(f"--{option} needs --time-budget.")
         return
-    if options.time_budget == 0:
-        raise InvalidArgumentError("--time-budget must be above 0, found 0 s.")
+    if not 0 < options.time_budget < math.inf:
+        raise InvalidArgumentError(
+            f"--time-budget must be above 0 and finite, found {options.time_budget:g} s."
+        )
     excluded = {
         "--preset": options.preset is not None,
         "--config": options.config is not None,

@@ -135,7 +135,7 @@ def levels(options: argparse.Namespace) -> None:
         for level in made:
             if level.report.shortfall:
                 say(shortfall_note(level.report))
-        if is_scored and cameras is not None and options.split is None:
+        if is_scored and cameras is not None and options.split != "test":
             say_wrapped(
                 "Levels were fitted to cameras of which some score, which favours them; with "
                 "--cameras and --split test, others do."

@@ -166,13 +166,12 @@ def simplify(options: argparse.Namespace) -> None:
         for job in jobs:
             check_written_files(job.options)
             cvtgs.io.check_save(job.options.output, overwrite=options.overwrite)
-        for job in jobs[1:]:
-            job.options.recalibrate = False  # once is enough
-
         with report_file(options) as file:
 
             def work(job: SceneJob) -> Outcome:
                 outcome, report = _simplify_one(job, checkpoint, config, settings)
+                for other in jobs:
+                    other.options.recalibrate = False  # once is enough
                 file.add(job, report)
                 return outcome
 
@@ -375,6 +374,10 @@ def _simplify_blocks(
 ) -> "SimplifyReport":
     """Simplify a file block by block, on this machine or on a cluster."""
     axes = read_axes(options.axes)
+    if options.lod:
+        raise InvalidArgumentError(
+            f"--lod must be 0 unless for a streamed SOG, found {options.lod} for {options.input}."
+        )
     with block_workers(options, memory) as (workers, share):
         return cvtgs.outofcore.simplify_file(
             options.input,

@@ -160,7 +160,7 @@ def stream_blocks(
         check_block_device(options)
         check_config(config, with_images=False)
     except (InputError, FileFormatError, ConfigError, InvalidArgumentError):
-        if options.scheduler is not None or (asked and options.input.suffix == ".ply"):
+        if options.scheduler is not None or (asked and options.input.suffix.lower() == ".ply"):
             raise
         return False
     if options.cameras is not None:
@@ -221,7 +221,7 @@ def stream_levels(
     errors = [level.geometric_error for level in plan.levels]
     if made[0].report.shortfall and not options.quiet:
         say(shortfall_note(made[0].report))
-    if options.memory is not None and options.input.suffix != ".ply" and not options.quiet:
+    if options.memory is not None and options.input.suffix.lower() != ".ply" and not options.quiet:
         say("In one piece: --memory has an effect on binary .ply files only.")
     _print_levels(options, len(plan.chunks), written, errors=errors)
 

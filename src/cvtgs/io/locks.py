@@ -77,9 +77,10 @@ def hidden_path(path: str | os.PathLike[str], ending: str) -> Path:
     if is_folder(target) and is_apart:
         return target / f".{ending}"
     name = f".{target.name}.{ending}"
-    if len(os.fsencode(name)) > LONGEST_NAME:
-        start = os.fsencode(target.name)[: LONGEST_NAME // 2].decode(errors="ignore")
-        name = f".{start}.{sha256(os.fsencode(target.name)).hexdigest()[:16]}.{ending}"
+    own = os.fsencode(target.name)
+    if len(own) <= LONGEST_NAME < len(os.fsencode(name)):  # no file can have a longer name
+        start = own[: LONGEST_NAME // 2].decode(errors="ignore")
+        name = f".{start}.{sha256(own).hexdigest()[:16]}.{ending}"
     return target.with_name(name)
 
 

@@ -41,7 +41,7 @@ def read_bytes(text: str) -> int:
     if not match:
         raise InvalidArgumentError(f"memory must be an amount such as 4GB, found {text!r}.")
     unit = (1024 if match[3] else 1000) ** " KMGT".index(match[2] or " ")
-    amount = int(float(match[1]) * unit)
+    amount = min(int(min(float(match[1]), 1e30) * unit), sys.maxsize)
     if amount < LEAST_BYTES:
         raise InvalidArgumentError(
             f"memory must be at least {LEAST_BYTES / 1e6:g} MB: torch and scipy take "

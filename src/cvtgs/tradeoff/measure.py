@@ -86,7 +86,8 @@ def tasks_of(presets: Sequence[str] | None, rhos: Sequence[float]) -> tuple[Task
     tasks = tuple(Task(preset=name, rho=rho) for rho in written_ratios(rhos) for name in names)
     if not tasks:
         raise InvalidArgumentError("give at least one preset and one ratio.")
-    twice = [task.name for number, task in enumerate(tasks) if task in tasks[:number]]
+    names_of_tasks = [task.name for task in tasks]  # of 15 digits
+    twice = [name for number, name in enumerate(names_of_tasks) if name in names_of_tasks[:number]]
     if twice:
         raise InvalidArgumentError(
             f"every preset and ratio must be given once, found {twice[0]} twice."

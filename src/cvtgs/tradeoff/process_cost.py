@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from cvtgs.errors import RunError, warn
+from cvtgs.processes import SAFE_PATH
 
 WARNING = "cvtgs: warning: "
 
@@ -82,7 +83,7 @@ def run_process(command: Sequence[str]) -> ProcessCost:
                 stdin=watched,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
-                env={**os.environ, "PYTHONIOENCODING": "utf-8"},
+                env={**os.environ, "PYTHONIOENCODING": "utf-8", SAFE_PATH: "1"},
             )
         with process:
             try:

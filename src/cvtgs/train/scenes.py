@@ -67,7 +67,9 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
     """List the scenes of a training without making them: files by name, then generated ones."""
     files = [path for folder in config.folders for path in _files_in(folder)]
     names = [path.stem for path in files]
-    held_out = {name.removesuffix(".ply") for name in config.validation} or set(names[1::5])
+    given = (Path(name) for name in config.validation)
+    stems = {path.stem if path.suffix.lower() == ".ply" else path.name for path in given}
+    held_out = stems or set(names[1::5])
     missing = sorted(held_out - set(names))
     if missing:
         raise ConfigError(f"data.validation: no file named {missing[0]}.ply in data.folders.")

@@ -293,11 +293,12 @@ class TrainState:
             theirs = theirs | {key: ours[key] for key in ("steps", "restart_step", "restart_rate")}
         odd = [key for key in ours if theirs[key] != ours[key]]
         if odd:
+            continues = odd[0] == "steps" and theirs["restart_step"] == 0
             more = f"; restart_step = {theirs['steps']} continues a finished one"
             raise CheckpointError(
                 f"{path}: the state belongs to a training run with another configuration "
                 f"({odd[0]} differs); restore the setting, or train to another output"
-                f"{more * (odd[0] == 'steps')}."
+                f"{more * continues}."
             )
 
     def _check_scenes(self, path: Path, scenes: list[dict[str, Any]]) -> None:

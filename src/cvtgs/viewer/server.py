@@ -144,7 +144,7 @@ def record_page(server: "viser.ViserServer", nodes: Sequence[SceneNode]) -> str:
 
 def look_at(server: "viser.ViserServer", scene: GaussianScene) -> Point:
     """Set up and the initial camera to a good view; return the place of labels in it."""
-    scene = scene.to("cpu")
+    scene = valid_part(scene.to("cpu"))
     up = find_layout(scene).up
     axis = int(up.abs().argmax())
     server.scene.set_up_direction(f"{'+' if up[axis] > 0 else '-'}{'xyz'[axis]}")
