@@ -142,7 +142,11 @@ def group_radius(points: Float[Tensor, "n 3"]) -> float:
     """
     if len(points) < GROUPED:
         return math.inf
-    sample = points.index_select(0, hashed_rows(points, 2 * GROUPED)).double()
+    rows = hashed_rows(points, 2 * GROUPED)
+    rows = rows[:: 1 + len(rows) // (4 * GROUPED)]  # a crowd at one position is there wholly
+    if len(rows) < GROUPED:
+        return math.inf
+    sample = points.index_select(0, rows).double()
     mode = "donot_use_mm_for_euclid_dist"  # products would lose digits far from the origin
     near = torch.cdist(sample[::16], sample, compute_mode=mode).kthvalue(len(sample) // 20).values
     return 7.0 * float(near.median()) or math.inf

@@ -222,7 +222,8 @@ class MergeNet(CellNetwork):
         known = self.known(summarize(descriptors)) * (pixels - (LEAST_PIXELS - 1)).clamp(0, 1)
         by_cell = known[:, None]
         areas = descriptors.pairs[:, :, AREA] / AREA_SCALE
-        distances = descriptors.pairs[:, :, [DISTANCE, DISTANCE_BACK]].amin(dim=2).expm1()
+        own, back = descriptors.pairs[:, :, DISTANCE], descriptors.pairs[:, :, DISTANCE_BACK]
+        distances = torch.minimum(own, back).expm1()
         lends = (areas - LEAST_AREA).clamp(0, 1) * (FARTHEST - distances).clamp(0, 1)
         return Residuals(
             d_means=(pulls[:, :3] + others[:, :3]) * by_cell,
