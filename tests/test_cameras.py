@@ -344,3 +344,11 @@ def test_centres_are_where_renderers_put_cameras_with_rounded_rotations(digits: 
     viewmats[:, :3, 3] = -(viewmats[:, :3, :3] @ eyes[:, :, None])[:, :, 0]
     cameras = Cameras(viewmats=viewmats, Ks=torch.eye(3)[None].double(), width=8, height=8)
     torch.testing.assert_close(cameras.centers, eyes, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
+def test_centres_have_the_dtype_of_the_cameras(dtype: torch.dtype) -> None:
+    viewmats = torch.eye(4, dtype=dtype)[None]
+    viewmats[0, :3, 3] = torch.tensor([1.0, 2.0, -4.0])
+    cameras = Cameras(viewmats=viewmats, Ks=torch.eye(3, dtype=dtype)[None], width=8, height=8)
+    assert torch.equal(cameras.centers, torch.tensor([[-1.0, -2.0, 4.0]], dtype=dtype))

@@ -95,9 +95,9 @@ class Cameras:
     @without_autocast()
     def centers(self) -> Float[Tensor, "c 3"]:
         """Positions of the cameras in the world, where renderers put them."""
-        rotations, shifts = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3:]
-        found: Tensor = torch.linalg.solve_ex(rotations, -shifts).result
-        return found[:, :, 0]
+        viewmats = self.viewmats.double()
+        found: Tensor = torch.linalg.solve_ex(viewmats[:, :3, :3], -viewmats[:, :3, 3:]).result
+        return found[:, :, 0].to(self.viewmats.dtype)
 
     def select(self, rows: Rows) -> Self:
         """Return some of the cameras, as ``cameras[rows]`` does.

@@ -269,6 +269,7 @@ def test_a_buffer_beside_a_gltf_counts_once(
     }
     path.write_text(json.dumps(document))
     stored = path.stat().st_size + len(spz)
+    assert cvtgs.io.scene_size(path) == stored
     assert f"found 3,000,000 Gaussians that take 168,000,000 bytes in a file of {stored:,};" in str(
         refusal(path)
     )

@@ -156,8 +156,8 @@ def _parts_of(file: Path) -> list[Path]:
     if file.suffix.lower() == ".gltf" and is_file(file) and file.stat().st_size < MOST_JSON_BYTES:
         with suppress(FileFormatError, AttributeError, KeyError, TypeError):  # a damaged file
             buffers = parse_json(file.read_bytes(), file).get("buffers", [])
-            names = {unquote(buffer["uri"]) for buffer in buffers if "uri" in buffer}
-            places = [file.parent / name for name in names if is_within(name)]
+            names = [unquote(buffer["uri"]) for buffer in buffers if "uri" in buffer]
+            places = {file.parent / name for name in names if is_within(name)}  # each once
             return [place for place in places if is_file(place)]
     return [part for pattern in patterns for part in file.parent.glob(pattern)]
 
