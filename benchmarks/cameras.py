@@ -88,13 +88,30 @@ def cameras_around(
     turns, rise = torch.deg2rad(azimuths.double())[:, None], math.radians(elevation)
     level = turns.cos() * across + turns.sin() * along
     eyes = middle + distance * radius * (math.cos(rise) * level + math.sin(rise) * up)
-    focal, half = size / 2 / math.tan(math.radians(FIELD / 2)), size / 2
-    intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]], dtype=up.dtype)
+    return looking(eyes, middle.expand_as(eyes), up, size=(size, size))
+
+
+def looking(
+    eyes: Float[Tensor, "c 3"],
+    targets: Float[Tensor, "c 3"],
+    up: Float[Tensor, "3"],
+    *,
+    size: tuple[int, int],
+    field: float = FIELD,
+) -> Cameras:
+    """Return cameras at some points that look at others, all float64.
+
+    ``size`` is the width and height of images in pixels, ``field`` the horizontal field of view in
+    degrees.
+    """
+    width, height = size
+    focal = 0.5 * width / math.tan(math.radians(field / 2))
+    rows = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
     return Cameras(
-        viewmats=look_at(eyes, middle.expand_as(eyes), up),
-        Ks=intrinsics.repeat(len(eyes), 1, 1),
-        width=size,
-        height=size,
+        viewmats=look_at(eyes, targets, up),
+        Ks=torch.tensor(rows, dtype=torch.float64).repeat(len(eyes), 1, 1),
+        width=width,
+        height=height,
     )
 
 

@@ -2,9 +2,9 @@
 
 ``python -m benchmarks.surroundings FOLDER --object OBJECT.ply`` writes one scene per kind of
 surroundings, ``KIND-OBJECT.ply``, with cameras around the object and looking outward; without
-``--object``, around a generated vase. All are y-down, and the object
-has a robust radius of 1. Captures cover what stands near with many small Gaussians, and walls,
-skies and haze with a few large ones: in ``faces6``, six Gaussians cover most of every image.
+``--object``, around a generated vase. All are y-down, and the object has a robust radius of 1.
+Captures cover what stands near with many small Gaussians, and walls, skies and haze with a few
+large ones: in ``faces6``, six Gaussians cover most of every image.
 """
 
 import argparse
@@ -19,11 +19,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import cvtgs
-from benchmarks.cameras import beside_format, cameras_file
-from benchmarks.placed import upright, without_tag
+from benchmarks.cameras import beside_format, cameras_file, looking
+from benchmarks.placed import UP, upright, without_tag
 from benchmarks.yards import Array, Part, joined_parts, turned_to, unit
 from cvtgs import edit, synthetic
-from cvtgs.cameras import Cameras, look_at
+from cvtgs.cameras import Cameras
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import valid_part
 
@@ -33,7 +33,7 @@ OBJECT = 40_000
 FLOOR = 0.9
 """Height of ground and floors, downward, in radii of the object."""
 
-SIDE, FIELD = 256, 50
+SIDE = 256  # of images, in pixels
 
 SKY_COLOR = np.array([0.4, 0.6, 0.9])
 WALL_COLORS = (
@@ -95,12 +95,8 @@ def cameras(kind: str) -> Cameras:
         eyes = np.stack([away * np.cos(turns), heights, away * np.sin(turns)], axis=1)
         outward = eyes[3:] * 5 + [0, -2, 0]
         targets = np.concatenate([np.broadcast_to([0, -0.15, 0], (3, 3)), outward])
-    up = torch.tensor([0.0, -1.0, 0.0]).double()
-    poses = look_at(torch.tensor(eyes).double(), torch.tensor(targets).double(), up)
-    focal, half = SIDE / 2 / math.tan(math.radians(FIELD / 2)), SIDE / 2
-    intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]]).double()
-    repeated = intrinsics.repeat(len(poses), 1, 1)
-    return Cameras(viewmats=poses, Ks=repeated, width=SIDE, height=SIDE)
+    points = (torch.tensor(rows).double() for rows in (eyes, targets, UP))
+    return looking(*points, size=(SIDE, SIDE))
 
 
 def sky(rng: Random, count: int, *, away: float) -> Part:

@@ -19,9 +19,9 @@ import torch
 from numpy.typing import NDArray
 
 import cvtgs
-from benchmarks.cameras import beside_format
+from benchmarks.cameras import beside_format, looking
 from cvtgs import synthetic
-from cvtgs.cameras import Cameras, look_at
+from cvtgs.cameras import Cameras
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
@@ -155,11 +155,8 @@ def cameras() -> Cameras:
     targets[:, 1] = -0.3
     targets[::3] = -eyes[::3]
     targets[::3, 1] = -0.6
-    poses = look_at(eyes, targets, torch.tensor([0.0, -1.0, 0.0]).double())
-    focal = 0.5 * WIDTH / math.tan(math.radians(30))
-    rows = [[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]]
-    intrinsics = torch.tensor(rows, dtype=torch.float64)
-    return Cameras(viewmats=poses, Ks=intrinsics.repeat(VIEWS, 1, 1), width=WIDTH, height=HEIGHT)
+    up = torch.tensor([0.0, -1.0, 0.0]).double()
+    return looking(eyes, targets, up, size=(WIDTH, HEIGHT), field=60)
 
 
 def _ground(count: int, fine: float, rng: np.random.Generator) -> Part:
