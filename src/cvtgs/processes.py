@@ -207,6 +207,7 @@ class LocalWorkers:
 
     def _run_error(self) -> RunError:
         """Return why the pool broke: by an error in starting processes, or by a signal."""
+        wait(self._starts, WAKE_SECONDS)  # the pool is broken a moment before they have failed
         for process in self._processes():
             process.join(WAKE_SECONDS)
         never_worked = all(start.done() and start.exception() for start in self._starts)

@@ -10,9 +10,11 @@ import sys
 import tempfile
 import threading
 import time
+from concurrent.futures import Future
 from concurrent.futures.process import _ResultItem
 from functools import partial
 from multiprocessing.reduction import ForkingPickler
+from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import psutil
@@ -338,6 +340,15 @@ def test_a_process_that_may_not_start_others_says_so(monkeypatch):
     monkeypatch.setitem(vars(multiprocessing.current_process())["_config"], "daemon", True)
     with pytest.raises(RunError, match=r"multiprocessing\.Pool may not start others; use"):
         LocalWorkers(2).__enter__()
+
+
+def test_a_pool_may_be_broken_before_its_starts_have_failed():
+    workers, start = LocalWorkers(1), Future()
+    pool = SimpleNamespace(_processes={1: MagicMock(exitcode=1)})
+    vars(workers).update(_pool=pool, _starts=[start])
+    threading.Timer(0.1, start.set_exception, [OSError()]).start()
+    error = vars(LocalWorkers)["_run_error"](workers)
+    assert str(error).startswith("no worker process could start")
 
 
 def test_a_script_without_a_guard_is_told_why_no_process_starts(tmp_path):
