@@ -24,7 +24,6 @@ settings in their names.
 """
 
 import argparse
-import hashlib
 import json
 import re
 import shlex
@@ -48,7 +47,7 @@ from benchmarks.compare_tables import (
     results_json,
     wrong_counts,
 )
-from benchmarks.measuring import Cost, machine, names_of, run, write_file
+from benchmarks.measuring import Cost, digest_of, filled, machine, names_of, run, write_file
 from benchmarks.quality import Scorer, judge_of, make_scorer, scenes, scoring_parser
 from cvtgs.errors import MissingDependencyError
 
@@ -236,18 +235,6 @@ def attempt(command: Sequence[str], task: Task, *, keep: bool) -> Run | None:
     if keep:
         write_file(costs, json.dumps({"made_by": made_by, "cost": asdict(cost)}).encode())
     return found, cost
-
-
-def digest_of(source: Path) -> str:
-    """Return the SHA-256 of the file of a scene."""
-    with cvtgs.io.scene_file(source).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def filled(part: str, places: Mapping[str, str]) -> str:
-    """Replace the placeholders in one argument; other braces stay."""
-    anywhere = "|".join(re.escape(place) for place in places)
-    return re.sub(anywhere, lambda found: places[found[0]], part)
 
 
 def judged(

@@ -24,6 +24,7 @@ class Result:
         count: Number of Gaussians in the output.
         wanted: Number of Gaussians that the output should have.
         judge: How the quality was measured; empty if unknown.
+        source: SHA-256 of the file of the scene; empty if unknown.
     """
 
     quality: Quality
@@ -32,6 +33,7 @@ class Result:
     count: int
     wanted: int
     judge: str = ""
+    source: str = ""
 
     def seconds(self, clock: Clock) -> float:
         """Return the wall-clock or the CPU time."""

@@ -1,11 +1,13 @@
-"""Shared by benchmarks: cost of processes and functions, generated files, tables on pages."""
+"""Shared by benchmarks: cost of processes and functions, files, words, tables on pages."""
 
+import hashlib
 import os
 import platform
+import re
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -119,6 +121,18 @@ def names_of(files: Sequence[Path]) -> list[str]:
         if names.count(name) > 1:
             raise SystemExit(f"{name}: is given {names.count(name)} times.")
     return names
+
+
+def digest_of(source: Path) -> str:
+    """Return the SHA-256 of a file, or of the file of the scene in a folder."""
+    with cvtgs.io.scene_file(source).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def filled(text: str, places: Mapping[str, str]) -> str:
+    """Replace the placeholders in a text; other braces stay."""
+    anywhere = "|".join(re.escape(place) for place in places)
+    return re.sub(anywhere, lambda found: places[found[0]], text)
 
 
 def write_file(path: Path, content: bytes) -> None:

@@ -9,7 +9,8 @@ published size: PSNR, SSIM, LPIPS. Seconds are wall-clock seconds of the process
 
 DIR gets ``paper.md`` (tables next to the published figures of ``published.json``),
 ``results.json``, and the simplified scenes in ``scenes``. To resume an interrupted run, start it
-again. Scenes that are missing or unusable are listed and left out.
+again; results of a model that was replaced are measured again. Scenes that are missing or unusable
+are listed and left out.
 """
 
 import argparse
@@ -23,7 +24,7 @@ import pydantic
 
 import cvtgs
 from benchmarks.baselines import BASELINES
-from benchmarks.compare import Task, attempt, baseline_methods, own_methods
+from benchmarks.compare import Run, Task, attempt, baseline_methods, own_methods
 from benchmarks.compare_tables import Result, Table, joined, markdown, read_results, results_json
 from benchmarks.datasets import (
     DATASETS,
@@ -31,7 +32,7 @@ from benchmarks.datasets import (
     find_captures,
     read_test_views,
 )
-from benchmarks.measuring import Cost, machine, write_file
+from benchmarks.measuring import Cost, digest_of, machine, write_file
 from benchmarks.quality import RATIOS, PhotographJudge, markdown_rows
 from benchmarks.worlds import place_cameras
 from cvtgs.errors import CvtgsError
@@ -71,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not found.captures:
         raise SystemExit(f"{options.datasets}: no scene with a trained model was found in it.")
     results = options.output / "results.json"
-    table = read_results(results)
+    table = of_present_models(read_results(results), found.captures)
     metrics = chosen_metrics(options.lpips, LARGE)
     network = metrics.lpips.network if metrics.lpips else f"none: {metrics.note}"
     keep_network(options.output / "lpips.txt", network)
@@ -129,6 +130,22 @@ def commands(methods: Sequence[str]) -> dict[str, list[str]]:
     return {name: (known | baseline_methods())[name] for name in methods}
 
 
+def of_present_models(table: Table, captures: Sequence[Capture]) -> Table:
+    """Drop the results of models that were replaced since, or that are unknown."""
+    sources = {key_of(capture): digest_of(capture.model.path) for capture in captures}
+    return {
+        scene: {
+            method: {
+                rho: result
+                for rho, result in row.items()
+                if result is None or result.source == sources.get(scene, result.source)
+            }
+            for method, row in rows.items()
+        }
+        for scene, rows in table.items()
+    }
+
+
 def measure(
     capture: Capture, table: Table, options: argparse.Namespace, metrics: Metrics
 ) -> Iterator[Table]:
@@ -143,7 +160,7 @@ def measure(
     has_full = known.get(FULL, {}).get(1.0) is not None
     if has_full and not todo:
         return
-    scene = cvtgs.load(capture.model.path)
+    scene, source = cvtgs.load(capture.model.path), digest_of(capture.model.path)
     views = read_test_views(capture)
     cameras = place_cameras(capture, scene, views.cameras)
     judge = PhotographJudge(cameras, views.photographs, capture.dataset.background, metrics)
@@ -155,7 +172,8 @@ def measure(
     )
     if not has_full:
         nothing = Cost(user_seconds=0.0, wall_seconds=0.0, peak_bytes=0, output="")
-        yield one_row(capture, FULL, 1.0, result_of(judge, scene, nothing, len(scene)))
+        full = result_of(judge, (scene, nothing), wanted=len(scene), source=source)
+        yield one_row(capture, FULL, 1.0, full)
     for method, rho in todo:
         count = cvtgs.target_count(len(scene), rho)
         task = Task(
@@ -165,19 +183,19 @@ def measure(
             output=(options.output / "scenes" / f"{capture.name} {rho:g} {method}.ply").resolve(),
         )
         made = attempt(commands([method])[method], task, keep=True)
-        found = made and result_of(judge, made[0], made[1], count)
+        found = made and result_of(judge, made, wanted=count, source=source)
         yield one_row(capture, method, rho, found)
 
 
-def result_of(
-    judge: PhotographJudge, scene: cvtgs.GaussianScene, cost: Cost, wanted: int
-) -> Result:
+def result_of(judge: PhotographJudge, made: Run, *, wanted: int, source: str) -> Result:
+    scene, cost = made
     return Result(
         quality=judge.score(scene),
         wall_seconds=cost.wall_seconds,
         cpu_seconds=cost.user_seconds,
         count=len(scene),
         wanted=wanted,
+        source=source,
     )
 
 

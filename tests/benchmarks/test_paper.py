@@ -10,6 +10,7 @@ from PIL import Image
 import cvtgs
 from benchmarks import paper
 from benchmarks.datasets import DATASETS, find_captures, read_test_views
+from benchmarks.measuring import digest_of
 from benchmarks.quality import Quality
 from dataset_files import (
     HALF,
@@ -165,6 +166,18 @@ def test_results_of_two_networks_of_lpips_are_not_mixed(tmp_path):
         f"{tmp_path}: its results were scored with LPIPS vgg, but this run would use alex; "
         f"choose the network with --lpips, or use another folder."
     )
+
+
+def test_results_of_a_replaced_model_are_dropped(root):
+    capture = capture_of(root, "garden")
+    found = Quality(psnr=20.0, ssim=0.5)
+    common = {"quality": found, "wall_seconds": 1, "cpu_seconds": 1, "count": 1, "wanted": 1}
+    known = paper.Result(**common, source=digest_of(capture.model.path))
+    table = {"Mip-NeRF 360: garden": {"paper": {0.1: known}}, "elsewhere": {"paper": {0.1: known}}}
+    assert paper.of_present_models(table, [capture]) == table
+    cvtgs.save(ball()[:100], capture.model.path, overwrite=True)
+    without = table | {"Mip-NeRF 360: garden": {"paper": {}}}
+    assert paper.of_present_models(table, [capture]) == without
 
 
 @pytest.mark.long
