@@ -17,10 +17,10 @@ Scenes and scorers are chosen as in ``benchmarks.quality``; ``--cameras CAPTURE 
 --images DIR`` scores against photographs. Run it once on a small scene first, so that compiled
 code is compiled and cached. ``--results FILE`` adds the results to those in the file and shows
 all of them, so that methods can be run one by one; ``--methods`` without names only shows them.
-Results of a scene must be of the same cameras, size and background. ``--outputs DIR`` keeps every
-file that a method wrote, with its seconds, and reuses a kept file of the same command, scene and
-count instead of running the method again. ``--set`` changes the presets, which then have the
-settings in their names.
+Results of a scene must be of the same file, cameras, size and background. ``--outputs DIR`` keeps
+every file that a method wrote, with its seconds, and reuses a kept file of the same command, scene
+and count (and version of cvtgs, except for tools) instead of running the method again. ``--set``
+changes the presets, which then have the settings in their names.
 """
 
 import argparse
@@ -45,9 +45,11 @@ from benchmarks.compare_tables import (
     markdown,
     read_results,
     results_json,
+    results_of,
+    systems_of,
     wrong_counts,
 )
-from benchmarks.measuring import Cost, digest_of, filled, machine, names_of, run, write_file
+from benchmarks.measuring import Cost, digest_of, filled, names_of, run, write_file
 from benchmarks.quality import Scorer, judge_of, make_scorer, scenes, scoring_parser
 from cvtgs.errors import MissingDependencyError
 
@@ -77,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     text = ""
     known = {} if options.results is None else read_results(options.results)
     if commands:
-        check_judges(known, options)
+        check_known(known, options)
     for measured in measure(commands, options) if commands else [{}]:
         table = joined(known, measured)
         if options.results is not None:
@@ -95,19 +97,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(text)
 
 
-def check_judges(known: Table, options: argparse.Namespace) -> None:
-    """Raise if known results of the scenes were scored by other images than these options ask."""
-    scored = {
-        name: [file] for name, file in zip(names_of(options.files), options.files, strict=True)
-    }
-    for name, files in (scored or {kind: [] for kind in cvtgs.synthetic.KINDS}).items():
-        here = judge_of(options, files)
-        for judge in judges_of({name: known.get(name, {})}):
-            if judge != here:
+def check_known(known: Table, options: argparse.Namespace) -> None:
+    """Raise if known results are of other scenes or images than these options ask for."""
+    files = dict(zip(names_of(options.files), options.files, strict=True))
+    for name, file in (files or dict.fromkeys(cvtgs.synthetic.KINDS)).items():
+        judge, source = judge_of(options, [] if file is None else [file]), source_of(options, file)
+        for result in results_of({name: known.get(name, {})}):
+            start = f"--results: {options.results} has results of {name}"
+            if result.judge not in ("", judge):
                 raise SystemExit(
-                    f"--results: {options.results} has results of {name} by another judge "
-                    f"({judge}); this is {here}. Name another file."
+                    f"{start} by another judge ({result.judge}); this is {judge}. Name another "
+                    f"file."
                 )
+            if result.source not in ("", source):
+                raise SystemExit(
+                    f"{start} of another scene ({result.source}); this is {source}. Name another "
+                    f"file."
+                )
+
+
+def source_of(options: argparse.Namespace, file: Path | None) -> str:
+    """Return what tells a scene from others of its name."""
+    return f"--count {options.count}" if file is None else digest_of(file)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -172,19 +183,20 @@ def measure(commands: Mapping[str, list[str]], options: argparse.Namespace) -> I
     table: dict[str, dict[str, dict[float, Result | None]]] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for scene_name, scene, source in sources(options, folder):
-            runs = {}
+        for scene_name, scene, full in sources(options, folder):
+            file = options.files[len(table)] if options.files else None
+            score, runs = make_scorer(options, file), {}
             for method, command in commands.items():
                 for rho in options.rho:
                     place = folder / "small.ply"
                     if options.outputs is not None:
                         place = options.outputs / kept_name(scene_name, rho, method)
                     count = cvtgs.target_count(len(scene), rho)
-                    task = Task(source=source, rho=rho, count=count, output=place)
+                    task = Task(source=full, rho=rho, count=count, output=place)
                     runs[method, task] = attempt(command, task, keep=options.outputs is not None)
-            file = options.files[len(table)] if options.files else None
             judge = judge_of(options, [] if file is None else [file])
-            table[scene_name] = judged(scene, runs, score=make_scorer(options, file), judge=judge)
+            source = source_of(options, file)
+            table[scene_name] = judged(scene, runs, score=score, judge=judge, source=source)
             print(f"compared on {scene_name}: {len(scene)} Gaussians", file=sys.stderr)
             yield dict(table)
 
@@ -212,6 +224,8 @@ def attempt(command: Sequence[str], task: Task, *, keep: bool) -> Run | None:
     """Run a method's command on a task, or load its kept file; return None on failure."""
     output, costs = task.output, task.output.with_suffix(".json")
     made_by = {"command": list(command), "count": task.count}
+    if command[:2] == [sys.executable, "-m"]:
+        made_by["cvtgs"] = cvtgs.__version__
     if keep:
         made_by["scene"] = digest_of(task.source)
     if keep and output.is_file() and costs.is_file():
@@ -243,6 +257,7 @@ def judged(
     *,
     score: Scorer,
     judge: str,
+    source: str,
 ) -> dict[str, dict[float, Result | None]]:
     """Score all results of one scene in one call of the scorer."""
     small = [made[0] for made in runs.values() if made is not None]
@@ -256,6 +271,8 @@ def judged(
             count=len(made[0]),
             wanted=task.count,
             judge=judge,
+            source=source,
+            system=made[1].system,
         )
     return rows
 
@@ -266,8 +283,8 @@ def report(table: Table, options: argparse.Namespace) -> str:
     clock = "wall-clock" if options.clock == "wall" else "user CPU"
     parts = [
         f"Scenes: {', '.join(table)}. Judge: {judge}. "
-        f"Seconds: {clock}, one process per run, reading and writing included; {machine()}. "
-        f"cvtgs {cvtgs.__version__}.",
+        f"Seconds: {clock}, one process per run, reading and writing included; "
+        f"{systems_of(table)}.",
         markdown(table, options.rho, means_only=options.means, clock=options.clock),
         wrong_counts(table),
         failures(table),

@@ -1,7 +1,7 @@
 """Results of a comparison, as a JSON file, Markdown tables and a chart."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import mean
@@ -24,7 +24,8 @@ class Result:
         count: Number of Gaussians in the output.
         wanted: Number of Gaussians that the output should have.
         judge: How the quality was measured; empty if unknown.
-        source: SHA-256 of the file of the scene; empty if unknown.
+        source: SHA-256 of the file of the scene, or the size of a generated one; empty if unknown.
+        system: The machine and the version of cvtgs that took the seconds; empty if unknown.
     """
 
     quality: Quality
@@ -34,6 +35,7 @@ class Result:
     wanted: int
     judge: str = ""
     source: str = ""
+    system: str = ""
 
     def seconds(self, clock: Clock) -> float:
         """Return the wall-clock or the CPU time."""
@@ -77,10 +79,21 @@ def read_results(path: Path) -> Table:
     return table
 
 
+def results_of(table: Table) -> list[Result]:
+    """Return all results of runs that did not fail."""
+    found = (result for rows in table.values() for row in rows.values() for result in row.values())
+    return [result for result in found if result is not None]
+
+
 def judges_of(table: Table) -> list[str]:
     """Return how the results were scored, as far as is known."""
-    results = (result for rows in table.values() for row in rows.values() for result in _at(row))
-    return [judge for judge in dict.fromkeys(result.judge for result in results) if judge]
+    return [judge for judge in dict.fromkeys(one.judge for one in results_of(table)) if judge]
+
+
+def systems_of(table: Table) -> str:
+    """Return the machines and versions of cvtgs that took the seconds."""
+    systems = dict.fromkeys(one.system for one in results_of(table))
+    return "; ".join(system or "an unknown machine" for system in systems)
 
 
 def methods_of(table: Table) -> list[str]:
@@ -117,11 +130,10 @@ def markdown(
 
 def means_table(table: Table, rho: float, clock: Clock) -> str:
     """Return a Markdown table of means over all scenes, a row per method."""
-    everything = [result for rows in table.values() for row in rows.values() for result in _at(row)]
     metrics = {
         name: metric
         for name, metric in METRICS.items()
-        if any(metric[0](result) is not None for result in everything)
+        if any(metric[0](result) is not None for result in results_of(table))
     }
     metrics["s"] = (lambda result: result.seconds(clock), ".1f")
     rows = []
@@ -150,10 +162,6 @@ def scenes_table(table: Table, rho: float) -> str:
             ]
         )
     return markdown_rows(["method", *table], rows)
-
-
-def _at(row: Mapping[float, Result | None]) -> Iterable[Result]:
-    return (result for result in row.values() if result is not None)
 
 
 def _cell(values: Sequence[float | None], form: str) -> str:

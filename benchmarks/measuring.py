@@ -16,7 +16,7 @@ import torch
 
 import cvtgs
 from cvtgs.devices import device_name
-from cvtgs.errors import RunError
+from cvtgs.errors import RunError, input_errors
 from cvtgs.io import atomic_output
 from cvtgs.tradeoff.process_cost import run_process
 
@@ -30,12 +30,14 @@ class Cost:
         wall_seconds: Wall-clock time from start to end.
         peak_bytes: Peak resident size.
         output: Its stdout.
+        system: The machine, and the version of cvtgs; empty if unknown.
     """
 
     user_seconds: float
     wall_seconds: float
     peak_bytes: int
     output: str
+    system: str = ""
 
 
 def run_python(*arguments: str) -> Cost:
@@ -55,6 +57,7 @@ def run(command: Sequence[str]) -> Cost:
         wall_seconds=cost.wall_seconds,
         peak_bytes=cost.peak_memory_bytes,
         output=cost.output,
+        system=f"{machine()}, cvtgs {cvtgs.__version__}",
     )
 
 
@@ -125,7 +128,7 @@ def names_of(files: Sequence[Path]) -> list[str]:
 
 def digest_of(source: Path) -> str:
     """Return the SHA-256 of a file, or of the file of the scene in a folder."""
-    with cvtgs.io.scene_file(source).open("rb") as file:
+    with input_errors(source), cvtgs.io.scene_file(source).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -25,14 +25,22 @@ import pydantic
 import cvtgs
 from benchmarks.baselines import BASELINES
 from benchmarks.compare import Run, Task, attempt, baseline_methods, own_methods
-from benchmarks.compare_tables import Result, Table, joined, markdown, read_results, results_json
+from benchmarks.compare_tables import (
+    Result,
+    Table,
+    joined,
+    markdown,
+    read_results,
+    results_json,
+    systems_of,
+)
 from benchmarks.datasets import (
     DATASETS,
     Capture,
     find_captures,
     read_test_views,
 )
-from benchmarks.measuring import Cost, digest_of, machine, write_file
+from benchmarks.measuring import Cost, digest_of, write_file
 from benchmarks.quality import RATIOS, PhotographJudge, markdown_rows
 from benchmarks.worlds import place_cameras
 from cvtgs.errors import CvtgsError
@@ -196,6 +204,7 @@ def result_of(judge: PhotographJudge, made: Run, *, wanted: int, source: str) ->
         count=len(scene),
         wanted=wanted,
         source=source,
+        system=cost.system,
     )
 
 
@@ -220,7 +229,7 @@ def report(
         "# The evaluation of CVT-GS\n",
         f"Against photographs that were held out; models of {layouts}; "
         f"LPIPS: {network}. Seconds: wall clock, one process per run, reading and "
-        f"writing included; {machine()}. cvtgs {cvtgs.__version__}.\n",
+        f"writing included; {systems_of(table)}.\n",
         gains_table(table, options.rho),
     ]
     for dataset in DATASETS:

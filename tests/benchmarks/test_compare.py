@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import sys
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ import cvtgs
 import lpips_cases
 from benchmarks import compare, compare_tables, quality
 from benchmarks.baselines import BASELINES, baseline
-from benchmarks.measuring import Cost, names_of
+from benchmarks.measuring import Cost, names_of, run
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.evaluation.images import as_bytes, encode
 from cvtgs.views import automatic_views
@@ -248,12 +249,13 @@ def test_names_of_kept_files_have_no_folders_and_all_digits():
 
 def test_results_say_how_they_were_scored(file, tmp_path):
     scene, task = cvtgs.load(file), compare.Task(source=file, rho=0.1, count=9, output=tmp_path)
-    cost = Cost(wall_seconds=1.0, user_seconds=2.0, peak_bytes=3, output="")
+    cost = Cost(wall_seconds=1.0, user_seconds=2.0, peak_bytes=3, output="", system="m")
     rows = compare.judged(
         scene,
         {("x", task): (scene, cost)},
         score=lambda full, small: [result(5.0).quality],
         judge="j",
+        source="s",
     )
     assert rows == {
         "x": {
@@ -264,6 +266,8 @@ def test_results_say_how_they_were_scored(file, tmp_path):
                 count=1000,
                 wanted=9,
                 judge="j",
+                source="s",
+                system="m",
             )
         }
     }
@@ -280,17 +284,45 @@ def test_results_of_another_judge_are_not_mixed(file, tmp_path):
     assert compare_tables.judges_of(scored) == ["another"]
 
 
-def test_the_judge_is_described(file):
-    def described(*arguments: str) -> str:
-        options = quality.scoring_parser("").parse_args([str(file), *arguments])
-        return quality.judge_of(options, options.files)
+def test_results_of_another_scene_are_not_mixed(file, tmp_path):
+    """Scenes of one name, and generated ones of different sizes, were."""
+    for arguments, name in ([str(file)], "thing"), (["--count", "50"], "object"):
+        scored = {name: {"x": {0.1: replace(result(20.0), source="other")}}}
+        (tmp_path / "results.json").write_text(compare_tables.results_json(scored))
+        words = [*arguments, "--results", str(tmp_path / "results.json"), "--methods", "draft"]
+        with pytest.raises(SystemExit, match=f"results of {name} of another scene"):
+            compare.main(words)
 
-    assert described("--size", "64").endswith("2 automatic views of 64 x 64 pixels, over black")
-    assert described("--cameras", "a", "--split", "test").endswith(
-        "cameras of a (test), over black"
-    )
-    file.with_suffix(".cameras.json").touch()
-    assert described("--size", "64").endswith("cameras beside the scenes at 64 pixels, over black")
+
+def test_seconds_are_of_the_machines_and_versions_that_took_them():
+    rows = {0.1: replace(result(20.0), system="old, cvtgs 0.1"), 0.2: result(1.0), 0.3: None}
+    options = compare.parser().parse_args(["--rho", "0.1"])
+    text = compare.report({"a": {"x": rows}}, options)
+    assert "writing included; old, cvtgs 0.1; an unknown machine.\n" in text
+    assert run([sys.executable, "-c", ""]).system.endswith(f", cvtgs {cvtgs.__version__}")
+
+
+def test_kept_files_of_another_version_are_not_used(file, tmp_path, monkeypatch):
+    command = [sys.executable, "-m", "shutil", "{IN}", "{OUT}"]
+    task = compare.Task(source=file, rho=0.1, count=100, output=tmp_path / "kept.ply")
+    cost, runs = Cost(wall_seconds=1.0, user_seconds=2.0, peak_bytes=3, output=""), []
+
+    def copied(words):
+        runs.append(words)
+        shutil.copy(words[3], words[4])
+        return cost
+
+    monkeypatch.setattr(compare, "run", copied)
+    for version, count in ("1", 1), ("1", 1), ("2", 2):
+        monkeypatch.setattr(cvtgs, "__version__", version)
+        assert compare.attempt(command, task, keep=True)[1] == cost
+        assert len(runs) == count
+
+
+def test_a_wrong_scorer_is_found_before_anything_runs(file, monkeypatch):
+    monkeypatch.setattr(compare, "attempt", None)
+    with pytest.raises(SystemExit, match="--images needs the cameras"):
+        compare.main([str(file), "--images", ".", "--methods", "draft"])
 
 
 def test_scenes_of_one_name_are_told_apart(tmp_path):
