@@ -28,7 +28,7 @@ from torch import Tensor
 
 import cvtgs
 from benchmarks.cameras import cameras_beside, cameras_file
-from benchmarks.measuring import names_of
+from benchmarks.measuring import digest_of, names_of
 from cvtgs.cameras import Cameras
 from cvtgs.errors import FileFormatError
 from cvtgs.evaluation import (
@@ -187,7 +187,11 @@ def judge_of(options: argparse.Namespace, files: Sequence[Path]) -> str:
         cameras += f" at {side} pixels" if options.size is not None else ""
         if not all(cameras_file(file).is_file() for file in files):
             cameras += f", {automatic} where there are none"
-    return f"cvtgs' own renderer, {cameras}, over {options.background}"
+    judge = f"cvtgs' own renderer, {cameras}, over {options.background}"
+    if options.lpips is None:
+        return judge
+    network, digest = any_lpips(options.lpips).network, digest_of(options.lpips)
+    return f"{judge}, LPIPS of {network} ({digest[:12]})"
 
 
 def given_scorer(
