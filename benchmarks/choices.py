@@ -28,7 +28,7 @@ from statistics import fmean
 
 import cvtgs
 from benchmarks.cameras import CACHE, FullImages, cameras_beside, spread_cameras
-from benchmarks.measuring import names_of, warm_up, write_file
+from benchmarks.measuring import names_of, settings_of, warm_up, write_file
 from benchmarks.quality import mean_or_none
 from cvtgs.cameras import Cameras
 from cvtgs.evaluation import EvaluationSettings, compare, write_comparison
@@ -136,14 +136,6 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--json", type=Path, help="also write the rows to this file")
     found.add_argument("--pages", type=Path, metavar="DIR", help="also write pages of images")
     return found
-
-
-def settings_of(words: Sequence[str]) -> dict[str, str]:
-    """Parse ``key=value`` words."""
-    wrong = [word for word in words if "=" not in word]
-    if wrong:
-        raise SystemExit(f"a setting must be KEY=VALUE, found {wrong[0]!r}.")
-    return dict(word.split("=", 1) for word in words)
 
 
 def simplifier_of(settings: Settings) -> cvtgs.Simplifier:

@@ -138,6 +138,14 @@ def filled(text: str, places: Mapping[str, str]) -> str:
     return re.sub(anywhere, lambda found: places[found[0]], text)
 
 
+def settings_of(words: Sequence[str]) -> dict[str, str]:
+    """Parse ``key=value`` words."""
+    wrong = [word for word in words if "=" not in word]
+    if wrong:
+        raise SystemExit(f"a setting must be KEY=VALUE; found {wrong[0]!r}.")
+    return dict(word.split("=", 1) for word in words)
+
+
 def write_file(path: Path, content: bytes) -> None:
     """Write a file atomically; create its folder if missing."""
     path.parent.mkdir(parents=True, exist_ok=True)

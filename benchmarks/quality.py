@@ -14,7 +14,6 @@ measures the choices without the network, which was trained with all of them unc
 import argparse
 import json
 import shlex
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,7 +27,7 @@ from torch import Tensor
 
 import cvtgs
 from benchmarks.cameras import cameras_beside, cameras_file
-from benchmarks.measuring import digest_of, names_of
+from benchmarks.measuring import digest_of, filled, names_of, run, settings_of
 from cvtgs.cameras import Cameras
 from cvtgs.errors import FileFormatError
 from cvtgs.evaluation import (
@@ -118,7 +117,7 @@ def scoring_parser(description: str | None) -> argparse.ArgumentParser:
 
 def configuration(options: argparse.Namespace, settings: Mapping[str, str]) -> cvtgs.SimplifyConfig:
     """Compose a configuration of the command line and ``settings`` (``preset`` too), which win."""
-    values = {**dict(item.split("=", 1) for item in options.set), **settings}
+    values = {**settings_of(options.set), **settings}
     return cvtgs.SimplifyConfig.compose(preset=values.pop("preset", None), settings=values)
 
 
@@ -285,14 +284,23 @@ def command_scorer(template: str) -> Scorer:
             for scene, path in zip([full, *small], paths, strict=True):
                 cvtgs.save(scene, path)
             first, *others = (shlex.quote(str(path)) for path in paths)
-            command = shlex.split(template.format(full=first, small=" ".join(others)))
-            output = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
-        return [
-            Quality(**{key: entry[key] for key in SCORES if key in entry})
-            for entry in json.loads(output)
-        ]
+            words = filled(template, {"{full}": first, "{small}": " ".join(others)})
+            return printed_scores(run(shlex.split(words)).output, len(small))
 
     return score
+
+
+def printed_scores(output: str, count: int) -> list[Quality]:
+    """Read the scores of some scenes that a command printed."""
+    try:
+        rows = json.loads(output)
+        found = [Quality(**{key: row[key] for key in SCORES if key in row}) for row in rows]
+    except (ValueError, TypeError):
+        found = []
+    if len(found) != count:
+        wanted = f"a JSON list of {count} objects with psnr and ssim"
+        raise SystemExit(f"--scorer must print {wanted}; found {output.strip()[:200]!r}.")
+    return found
 
 
 def means(table: Table) -> dict[str, list[Quality]]:

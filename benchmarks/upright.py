@@ -32,7 +32,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--up", nargs="*", default=[], metavar="NAME=AXIS", help="+x to -z")
     options = parser.parse_args(arguments)
-    known = dict(word.split("=", 1) for word in options.up)
+    known = {}
+    for word in options.up:
+        name, _, known[name] = word.rpartition("=")
+        if not name or known[name] not in AXES:
+            parser.error(f"--up must be NAME=AXIS, an axis of {', '.join(AXES)}; found {word!r}.")
     found = [angles(cvtgs.load(path), known.get(path.stem, "-y")) for path in options.files]
     print("| up is |", *(f"{axis} |" for axis in USUAL))
     print("|---" * (1 + len(USUAL)) + "|")

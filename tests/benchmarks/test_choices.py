@@ -211,5 +211,11 @@ def test_up_is_looked_for_in_every_convention(tmp_path, capsys):
         "| turned | 0° | 0° | 0° |",
         "| wrong | 0 | 0 | 0 |",
     ]
+    for wrong in ("turned", "turned=up"):
+        with pytest.raises(SystemExit):
+            upright.main([files[1], "--up", wrong])
+        assert f"NAME=AXIS, an axis of +x, -x, +y, -y, +z, -z; found '{wrong}'." in (
+            capsys.readouterr().err
+        )
     upright.main([files[1]])
     assert capsys.readouterr().out.splitlines()[-1] == "| wrong | 1 | 1 | 1 |"
