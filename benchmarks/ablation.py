@@ -45,7 +45,7 @@ from cvtgs.mergenet import MergeNet, PublishedMergeNet, correct_cells, load_chec
 from cvtgs.pipeline import merge_and_inflate
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.train.cases import MergedScene, merge_scene
-from cvtgs.validity import standardized
+from cvtgs.validity import standardized, valid_part
 
 PRESETS = ("paper", "standard")
 PARTS = ("w/o CVT", "w/o filter", "w/o MergeNet", "full")
@@ -216,7 +216,9 @@ def grouped_simplifier(
     """Return a simplifier with k-NN groups instead of the tessellation, otherwise as configured."""
 
     def simplify(scene: cvtgs.GaussianScene, rho: float) -> cvtgs.GaussianScene:
-        count = cvtgs.target_count(len(scene), rho)
+        count, valid = cvtgs.target_count(len(scene), rho), valid_part(scene)
+        if count >= len(valid):
+            return standardized(valid)  # there is nothing to group
         all_members = config.merge.model_copy(update={"representatives": False})
         whole = config.model_copy(update={"merge": all_members})
         reference = merge_scene(scene, count, whole)

@@ -20,6 +20,7 @@ around the scene, none of which score, as if they were those of the capture.
 
 import argparse
 import json
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -28,7 +29,7 @@ from statistics import fmean
 
 import cvtgs
 from benchmarks.cameras import CACHE, FullImages, cameras_beside, spread_cameras
-from benchmarks.measuring import names_of, settings_of, warm_up, write_file
+from benchmarks.measuring import difference, names_of, settings_of, warm_up, write_file
 from benchmarks.quality import mean_or_none
 from cvtgs.cameras import Cameras
 from cvtgs.evaluation import EvaluationSettings, compare, write_comparison
@@ -100,13 +101,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name, file in zip(names, options.files, strict=True):
         for row in measure(name, file, simplifiers, options):
             rows.append(row)
-            print(line(row, rows), flush=True)
+            print(line(row, rows, options), flush=True)
         save(rows, options.json)
     if len(options.files) > 1:
         averages: list[Row] = []
         for row in means(rows):
             averages.append(row)
-            print(line(row, averages))
+            print(line(row, averages, options))
         save([*rows, *averages], options.json)
 
 
@@ -229,35 +230,46 @@ COLUMNS = {
 """Heading, column width and decimals of each score."""
 
 
+def columns(options: argparse.Namespace) -> dict[str, tuple[str, int, int]]:
+    """Return the columns that the options ask for."""
+    return {
+        key: column for key, column in COLUMNS.items() if key != "lpips" or options.lpips != "off"
+    }
+
+
 def heads(options: argparse.Namespace) -> str:
     """Return the header line."""
     cells = [f"{'scene':16}", f"{'rho':>6}"]
     cells += [
-        f"{title:>{width + digits + 4}}"
-        for key, (title, width, digits) in COLUMNS.items()
-        if key != "lpips" or options.lpips != "off"
+        f"{title:>{width + digits + 4}}" for title, width, digits in columns(options).values()
     ]
     return "  ".join([*cells, f"{'CPU s':>6}", "configuration"])
 
 
-def line(row: Row, rows: Sequence[Row]) -> str:
-    """Format a row, each score with its difference to the base."""
+def line(row: Row, rows: Sequence[Row], options: argparse.Namespace) -> str:
+    """Format a row, each score with its difference to the base; a dash if not measured."""
     base = next(
         each for each in rows if (each.scene, each.rho, each.name) == (row.scene, row.rho, BASE)
     )
     cells = [f"{row.scene[:16]:16}", f"{row.rho:>6g}"]
-    for key, (_, width, digits) in COLUMNS.items():
+    for key, (_, width, digits) in columns(options).items():
         value, before = getattr(row, key), getattr(base, key)
-        if value is not None:
-            change = "" if row is base else f"{value - before:+.{digits}f}"
+        if value is None:
+            cells.append(f"{'-':>{width}} {'':{digits + 3}}")
+        else:
+            change = "" if row is base else f"{difference(value, before):+.{digits}f}"
             cells.append(f"{value:{width}.{digits}f} {change:>{digits + 3}}")
     return "  ".join([*cells, f"{row.seconds:6.2f}", row.name])
 
 
 def save(rows: Sequence[Row], path: Path | None) -> None:
-    """Write all rows as JSON, if a file is given."""
+    """Write all rows as JSON, if a file is given; infinite values, which JSON lacks, as null."""
     if path is not None:
-        write_file(path, (json.dumps([asdict(row) for row in rows], indent=1) + "\n").encode())
+        records = [
+            {key: None if value in (math.inf, -math.inf) else value for key, value in found.items()}
+            for found in map(asdict, rows)
+        ]
+        write_file(path, (json.dumps(records, indent=1) + "\n").encode())
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from torch import Tensor
 
 import cvtgs
 from benchmarks.cameras import cameras_around
+from benchmarks.measuring import settings_of
 from benchmarks.quality import scenes
 from cvtgs.cameras import Cameras
 from cvtgs.evaluation import psnr
@@ -25,14 +26,14 @@ HEIGHTS = ((90, 1.5), (60, 1.2), (35, 1.6), (20, 1.2), (20, 2.8), (10, 2.2), (-1
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("variants", nargs="+", help="FILES.ply, then presets with settings")
+    parser.add_argument("variants", nargs="+", help="files, then presets with settings")
     parser.add_argument("--rho", type=float, default=0.1)
     parser.add_argument("--views", type=int, default=12, help="views at each height")
     parser.add_argument("--size", type=int, default=256, help="side of the images, pixels")
     parser.add_argument("--count", type=int, default=60_000, help="size of generated scenes")
     options = parser.parse_intermixed_args()
-    files = [Path(word) for word in options.variants if word.endswith(".ply")]
-    variants = [word for word in options.variants if not word.endswith(".ply")]
+    variants = [word for word in options.variants if word.partition(" ")[0] in cvtgs.PRESETS]
+    files = [Path(word) for word in options.variants if word not in variants]
     print(f"| scene, rho {options.rho:g} | variant | all views |", end="")
     print(*(f" {height}°, {far:g} R |" for height, far in HEIGHTS), sep="")
     print("|---|---|---|" + "---|" * len(HEIGHTS))
@@ -44,7 +45,8 @@ def main() -> None:
         base = scores(scene, "standard", cameras, options.rho)
         print(f"| {name} | standard |", *(f"{value:.2f} |" for value in [base.mean(), *base]))
         for variant in variants:
-            gain = scores(scene, variant, cameras, options.rho) - base
+            found = scores(scene, variant, cameras, options.rho)
+            gain = torch.where(found == base, 0.0, found - base)  # which may be infinite
             words = (f"{value:+.2f} |" for value in [gain.mean(), *gain])
             print(f"| {name} | {variant} |", *words, flush=True)
 
@@ -60,8 +62,7 @@ def views_at(
 def scores(scene: cvtgs.GaussianScene, variant: str, cameras: list[Cameras], rho: float) -> Tensor:
     """Return the mean PSNR at each height."""
     preset, *words = variant.split()
-    settings = dict(word.split("=", 1) for word in words)
-    config = cvtgs.SimplifyConfig.compose(preset=preset, settings=settings)
+    config = cvtgs.SimplifyConfig.compose(preset=preset, settings=settings_of(words))
     small = cvtgs.Simplifier(config=config).simplify(scene, rho)
     pairs = ([cvtgs.render(one, views).rgb for one in (small, scene)] for views in cameras)
     return torch.stack([psnr(*(one.clamp(0, 1) for one in pair)).mean() for pair in pairs])

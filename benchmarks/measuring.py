@@ -90,6 +90,11 @@ def spread(values: Sequence[float]) -> str:
     return f"{statistics.median(values):.2f} ({min(values):.2f}-{max(values):.2f})"
 
 
+def difference(value: float, base: float) -> float:
+    """Subtract a base; two infinite values, of images without any error, are equal."""
+    return 0.0 if value == base else value - base
+
+
 def machine() -> str:
     """Return the names of processor and Python."""
     model = device_name(torch.device("cpu"))

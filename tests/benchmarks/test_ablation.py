@@ -106,6 +106,11 @@ def test_grouping_ignores_filtered_gaussians(scene):
     assert set(map(tuple, small.means.tolist())) == set(map(tuple, scene.means[:300].tolist()))
 
 
+def test_a_ratio_that_keeps_all_leaves_nothing_to_group(scene):
+    small = grouped_simplifier(cvtgs.SimplifyConfig.from_preset("paper"), None)(scene, 1.0)
+    assert torch.equal(small.means, scene.means)
+
+
 @pytest.mark.slow
 def test_the_table_and_the_files_are_complete(file, tmp_path, capsys):
     ablation.main([str(file), "--rho", "0.05", "-o", str(tmp_path / "new")])

@@ -1,6 +1,7 @@
 """The table of choices, and gains by the height of the view."""
 
 import json
+import math
 import sys
 from dataclasses import replace
 
@@ -177,11 +178,34 @@ def test_means_are_over_scenes():
     assert (found.scene, found.psnr, found.lpips) == ("mean", 25.0, None)
 
 
+def row_of(psnr: float, name: str = "base") -> choices.Row:
+    return choices.Row(
+        scene="a", rho=1.0, name=name, psnr=psnr, ssim=0.5, lpips=None, alpha_error=0.1,
+        alpha_bias=-0.1, seconds=1.0,
+    )  # fmt: skip
+
+
+def test_columns_stay_in_place_where_lpips_has_no_weights():
+    for mode in ("auto", "off"):
+        options = choices.parser().parse_args(["a.ply", "--lpips", mode])
+        head, row = choices.heads(options), choices.line(row_of(20.0), [row_of(20.0)], options)
+        assert head.index("CPU s") + len("CPU s") == row.index(" 1.00") + len(" 1.00")
+        assert ("-" in row.split()) == (mode == "auto")
+
+
+def test_images_without_any_error_have_no_difference_and_are_null_in_json(tmp_path):
+    rows = [row_of(math.inf), row_of(math.inf, "other")]
+    options = choices.parser().parse_args(["a.ply"])
+    assert choices.line(rows[1], rows, options).split()[2:4] == ["inf", "+0.00"]
+    choices.save(rows, tmp_path / "rows.json")
+    assert [one["psnr"] for one in json.loads((tmp_path / "rows.json").read_text())] == [None] * 2
+
+
 pytestmark = pytest.mark.slow
 
 
 def test_every_variant_is_compared_with_standard_at_every_height(tmp_path, monkeypatch, capsys):
-    file = tmp_path / "thing.ply"
+    file = tmp_path / "thing.spz"
     cvtgs.save(cvtgs.synthetic.scene("object", 300, sh_degree=0, seed=0), file)
     given = [str(file), "--rho", "0.1", "--views", "2", "--size", "24", "standard"]
     given.append("standard merge.inflation=2")
@@ -196,6 +220,11 @@ def test_every_variant_is_compared_with_standard_at_every_height(tmp_path, monke
     assert all(5 < float(value) < 60 for value in rows[0][2:])
     assert {float(value) for value in rows[1][2:]} == {0.0}
     assert any(float(value) != 0.0 for value in rows[2][2:])
+    given = [str(file), "--rho", "1", "--views", "1", "--size", "24", "draft"]
+    monkeypatch.setattr(sys, "argv", ["heights", *given])
+    heights.main()
+    _, kept = capsys.readouterr().out.splitlines()[-2:]
+    assert {cell.strip() for cell in kept.strip("|").split("|")[2:]} == {"+0.00"}
 
 
 def test_up_is_looked_for_in_every_convention(tmp_path, capsys):
