@@ -3,10 +3,11 @@
 ``python -m benchmarks.large levels`` compares the time of levels with that of separate runs;
 ``seams`` compares runs by blocks with runs in one piece, by the cameras beside a file where it has
 some (``benchmarks.cameras``); ``--fit 48`` gives presets with images that many others, and
-``--exact`` takes the ratio alone instead of five around it. ``blocks`` simplifies a large generated
-file in its own process and prints its user CPU seconds and peak memory. With ``--workers 1 2`` it
-also prints the speedup of two workers on two cores over one on one, and whether both write the
-same bytes. Tables are Markdown.
+``--exact`` takes the ratio alone instead of five around it. ``blocks`` simplifies large files, or a
+generated one of ``--count`` Gaussians, each in its own process, and prints user CPU seconds and
+peak memory. With ``--workers 1 2`` it also prints the speedup of two workers on two cores over one
+on one, and whether both write the same bytes. ``make`` writes a generated file. Tables are
+Markdown.
 """
 
 import argparse
@@ -24,7 +25,7 @@ import torch
 
 import cvtgs
 from benchmarks.cameras import cameras_beside, cameras_file, spread_cameras
-from benchmarks.measuring import cores, machine, names_of, run_python
+from benchmarks.measuring import cores, difference, generated_scenes, machine, names_of, run_python
 from benchmarks.quality import score_views
 from cvtgs.cameras import Cameras
 from cvtgs.outofcore import simplify_file
@@ -73,7 +74,7 @@ def levels(options: argparse.Namespace) -> None:
     torch.set_num_threads(1)  # waiting threads would count as CPU time
     simplifier = cvtgs.Simplifier(device="cpu")
     for name, scene in scenes(options):
-        simplifier.simplify(scene.select(torch.arange(1000)), 0.1)  # loads scipy
+        simplifier.simplify(scene[:1000], 0.1)  # loads scipy
         together, apart = [], []
         for _ in range(RUNS):
             times = [time.process_time()]
@@ -113,7 +114,7 @@ def seams(options: argparse.Namespace) -> None:
             path, output = Path(folder) / "in.ply", Path(folder) / "out.ply"
             cvtgs.save(scene, path)
             for number, share in itertools.product(numbers, shares):
-                rho = share * options.rho
+                rho = min(1.0, share * options.rho)
                 if number == 1:
                     found[number].append(simplifier.simplify(scene, rho, cameras=given))
                     continue
@@ -125,7 +126,7 @@ def seams(options: argparse.Namespace) -> None:
         psnr, ssim = zip(*(scores(scene, found[n], cameras) for n in numbers), strict=True)
         words = [f"{psnr[0]:.2f} ({ssim[0]:.4f}) |"]
         for one, other in zip(psnr[1:], ssim[1:], strict=True):
-            words.append(f"{one - psnr[0]:+.2f} ({other - ssim[0]:+.4f}) |")
+            words.append(f"{difference(one, psnr[0]):+.2f} ({other - ssim[0]:+.4f}) |")
         print(f"| {name}, {len(scene):,} | {preset} |", *words, flush=True)
 
 
@@ -136,7 +137,9 @@ def blocks(options: argparse.Namespace) -> None:
     print("|---|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         output, report = Path(folder) / "small.ply", Path(folder) / "report.json"
-        for file, workers in itertools.product(options.files, options.workers):
+        made = [("courtyard", options.count, 0)]
+        files = options.files or generated_scenes(Path(folder), made)
+        for file, workers in itertools.product(files, options.workers):
             memory = workers * read_bytes(options.memory)
             with cores(workers):
                 cost = run_python(
@@ -159,6 +162,8 @@ def blocks(options: argparse.Namespace) -> None:
 
 def make(options: argparse.Namespace) -> None:
     """Write a courtyard scene of ``--count`` Gaussians without view-dependent colour."""
+    if len(options.files) != 1:
+        raise SystemExit(f"make must have one file to write; found {len(options.files)}.")
     (file,) = options.files
     cvtgs.save(cvtgs.synthetic.scene("courtyard", options.count, sh_degree=0, seed=0), file)
 

@@ -1,10 +1,12 @@
 """Large files in blocks: the tables of workers and of seams."""
 
 import json
+import math
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 import cvtgs
 from benchmarks import cameras, large
@@ -66,3 +68,48 @@ def test_seams_are_scored_by_the_cameras_beside_a_file(tmp_path, monkeypatch, ca
     name, preset, whole, blocks = capsys.readouterr().out.splitlines()[-1].strip("| ").split(" | ")
     assert (name, preset) == ("a, 300", "standard")
     assert float(whole.split()[0]) > 0 > float(blocks.split()[0])
+
+
+def test_blocks_without_files_simplify_a_generated_one(monkeypatch, capsys):
+    def simplify(*words: str) -> Cost:
+        place = words.index("simplify")
+        assert len(cvtgs.load(words[place + 1])) == 2000
+        Path(words[place + 2]).write_bytes(b"1")
+        Path(words[words.index("--report") + 1]).write_text('{"output_count": 20, "blocks": 1}')
+        return Cost(user_seconds=1.0, wall_seconds=1.0, peak_bytes=10**6, output="")
+
+    monkeypatch.setattr(large, "run_python", simplify)
+    monkeypatch.setattr(sys, "argv", ["large", "blocks", "--count", "2000"])
+    large.main()
+    assert capsys.readouterr().out.splitlines()[-1].startswith("| courtyard_2k_sh0, 0.00 GB |")
+
+
+def test_make_needs_a_file(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["large", "make"])
+    with pytest.raises(SystemExit, match=r"make must have one file to write; found 0\."):
+        large.main()
+
+
+def test_levels_of_small_scenes(monkeypatch, capsys):
+    monkeypatch.setattr(torch, "set_num_threads", lambda _: None)
+    monkeypatch.setattr(large, "RUNS", 1)
+    monkeypatch.setattr(sys, "argv", ["large", "levels", "--count", "300", "--kinds", "object"])
+    large.main()
+    assert capsys.readouterr().out.splitlines()[-1].startswith("| object, 300 | ")
+
+
+def test_seams_where_nearly_all_is_kept(monkeypatch, capsys):
+    """Images without any error have no difference, and no ratio is above 1."""
+    rhos = []
+
+    def simplify(path, output, rho: float, **_) -> None:
+        rhos.append(rho)
+        cvtgs.save(cvtgs.load(path), output, overwrite=True)
+
+    monkeypatch.setattr(large, "simplify_file", simplify)
+    monkeypatch.setattr(large, "scores", lambda *_: (math.inf, 1.0))
+    words = ["--count", "100", "--kinds", "object", "--rho", "1", "--blocks", "2"]
+    monkeypatch.setattr(sys, "argv", ["large", "seams", *words])
+    large.main()
+    assert rhos == [0.97, 0.985, 1.0, 1.0, 1.0]
+    assert capsys.readouterr().out.splitlines()[-1].endswith("| inf (1.0000) | +0.00 (+0.0000) |")
