@@ -60,6 +60,8 @@ def main() -> None:
     parser.add_argument("--axes", type=int, choices=(3, 6), default=6, help="6 with colours")
     parser.add_argument("--share", type=float, default=0.08, help="sites per point")
     options = parser.parse_args()
+    if not 0 < options.share <= 1:
+        parser.error(f"--share must be above 0 and at most 1; found {options.share:g}.")
     device = torch.device(options.device)
     print("\n".join(search_table(device, options.counts, axes=options.axes, share=options.share)))
 

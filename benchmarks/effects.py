@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 
 import cvtgs
-from benchmarks.measuring import fastest, machine, renew_tables, run_python
+from benchmarks.measuring import around_tables, fastest, machine, renew_tables, run_python
 from benchmarks.quality import score_views
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.analysis.effects import (
@@ -129,6 +129,8 @@ def main() -> None:
         name, path, choice, settings = options.child
         print(json.dumps(run_child(name, path, choice, settings, options)))
         return
+    if options.output is not None:
+        around_tables(options.output, script="benchmarks.effects")
     text = "\n".join([effect_table(options), figure_table(options.count)])
     if options.output is None:
         print(text)

@@ -17,7 +17,7 @@ import torch
 
 import cvtgs
 from benchmarks.device_search import search_table
-from benchmarks.measuring import machine, renew_tables
+from benchmarks.measuring import around_tables, machine, renew_tables
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.devices import device_name
 from cvtgs.errors import CvtgsError
@@ -57,6 +57,7 @@ def main() -> None:
     parser.add_argument("--page", type=Path, default=PAGE)
     options = parser.parse_args()
     device = torch.device(options.device)
+    around_tables(options.page, script="benchmarks.gpu")
     text = "\n".join(
         [
             f"{device_name(device)}; CPU: {machine()}; torch {torch.__version__}, cvtgs "
@@ -67,7 +68,7 @@ def main() -> None:
             *preset_table(device, options.counts[0], rho=options.rho),
             *renderer_table(device, options.counts[0], size=options.size, runs=options.runs),
             *training_table(device, steps=options.steps),
-            *search_table(device, options.counts, axes=6, share=8 * options.rho),
+            *search_table(device, options.counts, axes=6, share=min(1.0, 8 * options.rho)),
         ]
     )
     print(text)
@@ -75,7 +76,7 @@ def main() -> None:
 
 
 def stage_table(device: torch.device, counts: Sequence[int], *, rho: float, runs: int) -> list[str]:
-    """Return a table of median seconds and peak per stage, and of seconds of a run on the CPU."""
+    """Return a table of median seconds and peak per stage, and of seconds on the CPU."""
     lines = [
         "| Gaussians, SH 0 | stage | device s | peak on the device MB | CPU s | CPU / device |",
         "|---|---|---|---|---|---|",
@@ -86,15 +87,17 @@ def stage_table(device: torch.device, counts: Sequence[int], *, rho: float, runs
         moved = [seconds(partial(scene.to, device), device) for _ in range(runs + 1)]
         there = scene.to(device)
         small, reports = repeat(there, SimplifyConfig(), rho, device=device, runs=runs)
-        on_cpu, report = Simplifier(device="cpu").run(scene, rho)
-        lines.append(row(count, "copy", statistics.median(moved[1:]), 0, None))
-        for stages in zip(*(one.stages for one in reports), strict=True):
-            costs = {stage.stage: stage.seconds for stage in report.stages}
-            name, peak = stages[0].stage, max(one.peak_device_memory_bytes for one in stages)
-            median = statistics.median(one.seconds for one in stages)
-            lines.append(row(count, name, median, peak, costs[name]))
-        all_seconds = statistics.median(one.seconds for one in reports)
-        lines.append(row(count, "all", all_seconds, 0, report.seconds))
+        (on_cpu, *_), others = repeat(
+            scene, SimplifyConfig(), rho, device=torch.device("cpu"), runs=runs
+        )
+        lines.append(row(count, "copy", statistics.median(moved[1:]), None, None))
+        medians, peaks, on_host = (
+            stage_seconds(reports),
+            stage_peaks(reports),
+            stage_seconds(others),
+        )
+        for stage, found in medians.items():
+            lines.append(row(count, stage, found, peaks[stage], on_host[stage]))
         same = all(equal(small[0], one) for one in small[1:])
         found, wanted = (
             scores.psnr.mean
@@ -143,14 +146,13 @@ def color_table(device: torch.device, counts: Sequence[int], *, rho: float, runs
     ]
     for count in counts:
         scene = cvtgs.synthetic.scene("courtyard", count, sh_degree=3, seed=0)
-        copy = statistics.median([seconds(partial(scene.to, device), device) for _ in range(runs)])
-        _, reports = repeat(scene.to(device), SimplifyConfig(), rho, device=device, runs=runs)
-        report = Simplifier(device="cpu").run(scene, rho).report
-        median = statistics.median(one.seconds for one in reports)
-        stages = (stage for one in reports for stage in one.stages)
-        peak = max(stage.peak_device_memory_bytes for stage in stages) / 1e6
-        line = f"| {count:,} | {copy:.3f} | {median:.3f} | {peak:.0f} | {report.seconds:.2f} |"
-        lines.append(line)
+        moved = [seconds(partial(scene.to, device), device) for _ in range(runs + 1)]
+        copy, config = statistics.median(moved[1:]), SimplifyConfig()
+        _, reports = repeat(scene.to(device), config, rho, device=device, runs=runs)
+        _, others = repeat(scene, config, rho, device=torch.device("cpu"), runs=runs)
+        there, here = (stage_seconds(some)["all"] for some in (reports, others))
+        peak = stage_peaks(reports)["all"] / 1e6
+        lines.append(f"| {count:,} | {copy:.3f} | {there:.3f} | {peak:.0f} | {here:.2f} |")
     return [*lines, ""]
 
 
@@ -255,6 +257,24 @@ def repeat(
     return [one.scene.to("cpu") for one in counted], [one.report for one in counted]
 
 
+def stage_seconds(reports: Sequence[SimplifyReport]) -> dict[str, float]:
+    """Return the median seconds of every stage, and of all together."""
+    found = {
+        stages[0].stage: statistics.median(one.seconds for one in stages)
+        for stages in zip(*(report.stages for report in reports), strict=True)
+    }
+    return found | {"all": statistics.median(report.seconds for report in reports)}
+
+
+def stage_peaks(reports: Sequence[SimplifyReport]) -> dict[str, int]:
+    """Return the peak bytes of every stage on the device, and the largest of all."""
+    found = {
+        stages[0].stage: max(one.peak_device_memory_bytes for one in stages)
+        for stages in zip(*(report.stages for report in reports), strict=True)
+    }
+    return found | {"all": max(found.values())}
+
+
 def seconds(work: Callable[[], object], device: torch.device) -> float:
     """Return the wall-clock seconds of a function on a device."""
     start = time.perf_counter()
@@ -264,11 +284,12 @@ def seconds(work: Callable[[], object], device: torch.device) -> float:
     return time.perf_counter() - start
 
 
-def row(count: int, stage: str, found: float, peak: int, cpu: float | None) -> str:
-    """Format a row of the table of stages."""
+def row(count: int, stage: str, found: float, peak: int | None, cpu: float | None) -> str:
+    """Format a row of the table of stages; cells without a value stay empty."""
+    memory = "" if peak is None else f"{peak / 1e6:.0f}"
     ratio = "" if cpu is None else f"{cpu / found:.1f}"
     beside = "" if cpu is None else f"{cpu:.3f}"
-    return f"| {count:,} | {stage} | {found:.3f} | {peak / 1e6:.0f} | {beside} | {ratio} |"
+    return f"| {count:,} | {stage} | {found:.3f} | {memory} | {beside} | {ratio} |"
 
 
 def equal(one: GaussianScene, other: GaussianScene) -> bool:

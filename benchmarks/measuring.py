@@ -160,10 +160,19 @@ def write_file(path: Path, content: bytes) -> None:
 
 def renew_tables(page: Path, text: str, *, script: str) -> None:
     """Replace the tables of a script on a page."""
+    before, after = around_tables(page, script=script)
+    page.write_text(f"{before}\n\n{text}\n{after}", encoding="utf-8")
+
+
+def around_tables(page: Path, *, script: str) -> tuple[str, str]:
+    """Return what is before and after the tables of a script on a page; exit without them."""
     start, end = f"<!-- tables: python -m {script} -->", "<!-- end of tables -->"
-    before, rest = page.read_text(encoding="utf-8").split(start)
-    after = rest.split(end)[1]
-    page.write_text(f"{before}{start}\n\n{text}\n{end}{after}", encoding="utf-8")
+    with input_errors(page):
+        before, begins, rest = page.read_text(encoding="utf-8").partition(start)
+    _, ends, after = rest.partition(end)
+    if not ends:
+        raise SystemExit(f"{page}: must have the lines {start!r} and {end!r}; found none.")
+    return before + begins, ends + after
 
 
 def warm_up() -> None:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 import cvtgs
-from benchmarks.measuring import fastest, machine, renew_tables
+from benchmarks.measuring import around_tables, fastest, machine, renew_tables
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.cells import Partition, merge_cells
 from cvtgs.cells.merge import gather_members, mean_and_covariance
@@ -59,6 +59,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.output is not None and (options.case is not None or not options.timed):
         parser.error("-o replaces both tables, so it needs all cases and times.")
+    if options.output is not None:
+        around_tables(options.output, script="benchmarks.numerics")
     cases = {name: make for name, make in catalogue().items() if name in (options.case or [name])}
     text = error_table(cases, options.count)
     if options.timed:

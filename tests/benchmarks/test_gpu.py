@@ -2,11 +2,13 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from benchmarks import gpu, numerics
+from benchmarks import device_search, effects, gpu, numerics
+from cvtgs.errors import InputNotFoundError
 from hard_cases import CASES
 from pretended_device import pretended_cuda
 
@@ -59,6 +61,66 @@ def test_the_page_of_the_pretended_device(tmp_path, monkeypatch):
     assert text.count("\n| 300 | ") >= 10
     for start in ("300 | network", "300, 300", "torch"):
         assert f"\n| {start} | " in text
+
+
+def test_cpu_and_device_are_measured_by_the_same_rule(monkeypatch):
+    """Medians after a warm-up, peaks over the stages, and no peak of the copy."""
+    device, runs, seconds = torch.device("cpu"), [], iter([100.0, 1.0, 5.0, 3.0])
+    repeat = gpu.repeat
+    monkeypatch.setattr(gpu, "VIEWS", 1)
+    monkeypatch.setattr(gpu, "seconds", lambda *_: next(seconds))
+    monkeypatch.setattr(gpu, "repeat", lambda *a, **k: runs.append(k["runs"]) or repeat(*a, **k))
+    assert gpu.color_table(device, [300], rho=0.1, runs=3)[2].startswith("| 300 | 3.000 | ")
+    assert runs == [3, 3]
+    monkeypatch.setattr(gpu, "seconds", lambda *_: 1.0)
+    _, _, copy, *_ = gpu.stage_table(device, [300], rho=0.1, runs=1)
+    assert copy == "| 300 | copy | 1.000 |  |  |  |"
+    assert runs == [3, 3, 1, 1]
+    peaks = gpu.stage_peaks([report_of(1, 8), report_of(4, 2)])
+    assert peaks == {"filter": 4, "merge": 8, "all": 8}
+
+
+def report_of(*peaks: int) -> SimpleNamespace:
+    names = ("filter", "merge")
+    stages = [
+        SimpleNamespace(stage=name, seconds=1.0, peak_device_memory_bytes=peak)
+        for name, peak in zip(names, peaks, strict=True)
+    ]
+    return SimpleNamespace(stages=stages)
+
+
+def test_no_more_sites_than_points_are_searched(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["device_search", "--share", "2"])
+    with pytest.raises(SystemExit):
+        device_search.main()
+    assert "--share must be above 0 and at most 1; found 2." in capsys.readouterr().err
+    shares = []
+    tables = ("stage", "files", "color", "preset", "renderer", "training")
+    for name in tables:
+        monkeypatch.setattr(gpu, f"{name}_table", lambda *_, **__: [])
+    monkeypatch.setattr(gpu, "search_table", lambda *_, share, **__: shares.append(share) or [])
+    monkeypatch.setattr(gpu, "around_tables", lambda *_, **__: ("", ""))
+    monkeypatch.setattr(gpu, "renew_tables", lambda *_, **__: None)
+    monkeypatch.setattr(sys, "argv", ["gpu", "--device", "cpu", "--rho", "0.25"])
+    gpu.main()
+    assert shares == [1.0]
+
+
+@pytest.mark.parametrize("module", [effects, gpu, numerics])
+def test_a_page_without_tables_is_refused_before_anything_is_measured(
+    tmp_path, monkeypatch, module
+):
+    page = tmp_path / "page.md"
+    name = module.__name__.partition(".")[2]
+    words = ["--page", str(page), "--device", "cpu"] if module is gpu else ["-o", str(page)]
+    monkeypatch.setattr(sys, "argv", [name, *words])
+    for table in ("stage_table", "error_table", "effect_table"):
+        monkeypatch.setattr(module, table, None, raising=False)
+    with pytest.raises(InputNotFoundError):
+        module.main()
+    page.write_text(f"<!-- tables: python -m benchmarks.{name} -->")
+    with pytest.raises(SystemExit, match=r"page\.md: must have the lines .* found none\."):
+        module.main()
 
 
 pytestmark = pytest.mark.slow
