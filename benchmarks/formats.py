@@ -19,7 +19,7 @@ from unittest import mock
 import torch
 
 import cvtgs
-from benchmarks.measuring import Cost, generated_scenes, machine, run_python, spread
+from benchmarks.measuring import Cost, generated_scenes, machine, names_of, run_python, spread
 from benchmarks.quality import score_views
 from benchmarks.speed import SCENES as LARGE_SCENES
 from cvtgs.errors import DroppedDataWarning
@@ -49,7 +49,8 @@ def main() -> None:
 
 def compare_formats(options: argparse.Namespace) -> None:
     warnings.simplefilter("ignore", DroppedDataWarning)
-    scenes = {file.name: cvtgs.load(file) for file in options.files} or {
+    named = zip(names_of(options.files), options.files, strict=True)
+    scenes = {name: cvtgs.load(file) for name, file in named} or {
         f"{kind}, SH {degree}": cvtgs.synthetic.scene(kind, options.count, sh_degree=degree)
         for kind, degree in SCENES
     }
@@ -84,17 +85,18 @@ def seconds(job: Callable[[], object]) -> float:
 
 
 def compare_readers(options: argparse.Namespace) -> None:
-    bare = run_python("-c", "import torch, plyfile").peak_bytes
+    bare = run_python("-c", "import benchmarks.formats, plyfile").peak_bytes
     with tempfile.TemporaryDirectory() as folder:
         print(f"{machine()}, {options.runs} runs\n")
         print("| file | reader | CPU s | peak above bare / file |\n|---|---|---|---|")
-        for file in options.files or generated_scenes(Path(folder), LARGE_SCENES):
+        files = options.files or generated_scenes(Path(folder), LARGE_SCENES)
+        for name, file in zip(names_of(files), files, strict=True):
             for reader in READERS:
                 costs = [read_once(file, reader) for _ in range(options.runs)]
                 peak = statistics.median(cost.peak_bytes for cost in costs)
                 seconds = spread([float(cost.output) for cost in costs])
                 ratio = (peak - bare) / file.stat().st_size
-                print(f"| {file.stem} | {reader} | {seconds} | {ratio:.2f} |", flush=True)
+                print(f"| {name} | {reader} | {seconds} | {ratio:.2f} |", flush=True)
 
 
 def read_once(file: Path, reader: str) -> Cost:
