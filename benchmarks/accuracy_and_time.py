@@ -6,6 +6,7 @@ Seconds are CPU seconds of ``Simplifier.run``, without start-up, reading and wri
 over the scenes.
 """
 
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -13,7 +14,7 @@ from pathlib import Path
 from statistics import mean
 
 import cvtgs
-from benchmarks.measuring import warm_up
+from benchmarks.measuring import warm_up, write_file
 from benchmarks.quality import (
     CHOICES,
     Quality,
@@ -25,6 +26,7 @@ from benchmarks.quality import (
     measure,
     scoring_parser,
 )
+from cvtgs.errors import MissingDependencyError
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.tradeoff.files import ticks
 
@@ -116,11 +118,11 @@ def chart(
     return line_chart(panels, width=1200, height=500)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = scoring_parser(__doc__)
     parser.add_argument("--png", type=Path, help="draw the presets to this file")
     parser.add_argument("--table", choices=TABLES, help="print only this table")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     warm_up()
     for name in [options.table] if options.table else TABLES:
         title, rows = TABLES[name]
@@ -130,7 +132,10 @@ def main() -> None:
         scores = means(found)
         print(f"## {title}\n\n{table(watches, scores, options.rho)}", flush=True)
         if rows is PRESETS and options.png is not None:
-            options.png.write_bytes(chart(watches, scores, options.rho))
+            try:
+                write_file(options.png, chart(watches, scores, options.rho))
+            except MissingDependencyError as error:
+                print(f"without a plot: {error}", file=sys.stderr)
 
 
 if __name__ == "__main__":

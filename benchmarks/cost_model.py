@@ -84,10 +84,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         path.write_text(text + "\n", encoding="utf-8")
         print(f"{machine()}; wrote {path}")
         return
+    scenes = [scene for scene in SCENES if scene[1] <= options.most]
+    if not (options.files or scenes):
+        least = min(scene[1] for scene in SCENES)
+        parser.error(f"--most must be at least {least:,}; found {options.most:,}.")
     model = cost_model(recalibrate=options.recalibrate)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        scenes = [scene for scene in SCENES if scene[1] <= options.most]
         files = options.files or generated_scenes(folder, scenes, seed=SEED)
         rows = [row for file in files for row in measured(file, folder, model, options)]
     print(f"{machine()}; {options.clock} seconds, the fastest of {options.runs} runs\n")
