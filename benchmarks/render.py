@@ -20,6 +20,7 @@ from benchmarks.measuring import generated_scenes, machine, run_python, spread
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.clock import peak_memory_bytes
 from cvtgs.rendering import BackendName, render
+from cvtgs.validity import valid_part
 
 SCENES = (("courtyard", 150_000, 0), ("courtyard", 150_000, 3), ("object", 150_000, 3))
 
@@ -63,7 +64,7 @@ def row(file: Path, backend: str, options: argparse.Namespace) -> str:
 
 def costs(options: argparse.Namespace) -> dict[str, float | list[float]]:
     """Measure one backend on one scene, in this process."""
-    scene = cvtgs.load(options.files[0]).to(options.device)
+    scene = valid_part(cvtgs.load(options.files[0])).to(options.device)
     cameras = orbit(scene, options.views, options.size)
     views = cameras.singles()
     first = seconds(scene, views[0], options.child, backward=True)

@@ -19,6 +19,7 @@ import cvtgs
 from benchmarks.measuring import cores, generated_scenes, machine, run_python, spread
 from cvtgs.devices import core_count
 from cvtgs.math.frames import morton_order, robust_frame
+from cvtgs.validity import valid_part
 
 SCENES = (("courtyard", 1_000_000, 0), ("courtyard", 250_000, 2), ("courtyard", 400_000, 3))
 
@@ -137,7 +138,8 @@ def stage_costs(file: Path, rho: float, preset: str) -> dict[str, float]:
 
 def one_pass(scene: cvtgs.GaussianScene, count: int) -> float:
     """Time the search of the nearest of ``count`` sites for every Gaussian, by position only."""
-    points = robust_frame(scene.means).contract(scene.means)
+    means = valid_part(scene).means
+    points = robust_frame(means).contract(means)
     points = points[morton_order(points)]
     sites = points[:: len(points) // count][:count]
     start = time.process_time()

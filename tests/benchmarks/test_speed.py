@@ -1,13 +1,15 @@
 """Speed: stages on one core against all."""
 
+import math
 import os
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 import cvtgs
-from benchmarks import speed
+from benchmarks import render, speed
 from cvtgs.devices import core_count
 from cvtgs.synthetic import demo_scene
 
@@ -23,6 +25,22 @@ def test_the_seconds_of_all_stages_are_their_sum(scene_file):
     total = seconds.pop("all")
     assert total == pytest.approx(sum(seconds.values()))
     assert {"plan", "tessellate", "merge"} <= seconds.keys()
+
+
+def with_an_invalid_row(path: Path) -> Path:
+    scene = demo_scene(2000, seed=0)
+    scene.means[5] = math.nan
+    cvtgs.save(scene, path)
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
+def test_rows_with_nan_are_left_out(tmp_path):
+    file = with_an_invalid_row(tmp_path / "scene.ply")
+    assert speed.stage_costs(file, 0.1, "draft")["floor"] > 0
+    options = SimpleNamespace(files=[file], device="cpu", views=1, size=16, child="torch")
+    assert render.costs(options)["first"] > 0
 
 
 @pytest.mark.skipif(core_count() < 2, reason="needs two cores")
