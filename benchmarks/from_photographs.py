@@ -33,6 +33,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.evaluation import fit_cameras, load_photographs
 from cvtgs.evaluation.scorer import Metrics, chosen_metrics
 from cvtgs.losses import image_loss
+from cvtgs.validity import valid_part
 from cvtgs.views import automatic_views
 
 WHITE = (1.0, 1.0, 1.0)
@@ -53,15 +54,21 @@ METHODS = ("paper", "paper, no network", "standard", "mass pruning")
 def main(arguments: Sequence[str] | None = None) -> None:
     options = parser().parse_args(arguments)
     folder = options.dataset or options.output / "dataset"
-    if options.dataset is None and not (folder / "transforms_test.json").is_file():
-        take_pictures(folder, views=options.views, size=options.size, seed=options.seed)
+    if options.dataset is None:
+        if (folder / "transforms_test.json").is_file():
+            print(f"{folder}: is used as it is, whatever --views and --seed are.", file=sys.stderr)
+        else:
+            take_pictures(folder, views=options.views, size=options.size, seed=options.seed)
     for split in ("train", "test"):
         if not (folder / f"transforms_{split}.json").is_file():
             raise SystemExit(f"{folder}: must hold transforms_{split}.json, found none.")
     train, test = (read_split(folder, split, options.size) for split in ("train", "test"))
     model = options.output / "point_cloud" / f"iteration_{options.steps}" / "point_cloud.ply"
-    if not model.is_file():
-        points = None if options.points is None else cvtgs.load(options.points).means
+    if model.is_file():
+        said = "is not trained again, whatever --count, --size, --seed and --points are"
+        print(f"{model}: {said}.", file=sys.stderr)
+    else:
+        points = None if options.points is None else valid_part(cvtgs.load(options.points)).means
         first = first_scene(train[0], options.count, points=points, seed=options.seed)
         model.parent.mkdir(parents=True, exist_ok=True)
         cvtgs.save(fit(first, *train, steps=options.steps, seed=options.seed), model)

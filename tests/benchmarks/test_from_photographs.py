@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -92,6 +93,24 @@ def test_the_table_shows_the_loss_of_quality():
     lines = from_photographs.table(rows).splitlines()
     assert lines[2] == "| trained | 25.00 | 0.9000 | - | +0.00 |"
     assert lines[3] == "| small | 22.50 | 0.8000 | - | -2.50 |"
+
+
+@pytest.mark.slow
+def test_what_an_earlier_run_made_is_used_and_named(dataset, tmp_path, monkeypatch, capsys):
+    """Rows of --points with NaN are left out of the first scene."""
+    scene = cvtgs.synthetic.scene("object", 60, sh_degree=0, seed=0)
+    scene.means[5] = math.nan
+    cvtgs.save(scene, tmp_path / "points.ply")
+    monkeypatch.setattr(from_photographs, "METHODS", ())
+    shutil.copytree(dataset, tmp_path / "out" / "dataset")
+    words = ["-o", str(tmp_path / "out"), "--steps", "1", "--points", str(tmp_path / "points.ply")]
+    from_photographs.main(words)
+    printed = capsys.readouterr()
+    assert "| trained, 59 Gaussians |" in printed.out
+    assert "dataset: is used as it is, whatever --views and --seed are." in printed.err
+    assert "point_cloud.ply: is not trained again" not in printed.err
+    from_photographs.main(words)
+    assert "point_cloud.ply: is not trained again" in capsys.readouterr().err
 
 
 def test_a_folder_without_a_split_is_refused_in_one_sentence(tmp_path):
