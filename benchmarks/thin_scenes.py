@@ -5,7 +5,6 @@ the compensation of Mip-Splatting, for scenes of ``tests/hard_cases.py``.
 """
 
 import argparse
-import math
 
 import torch
 
@@ -36,7 +35,7 @@ def main() -> None:
         size = options.size
         cameras = automatic_views(scene, options.views, width=size, height=size)
         for rho in options.rho:
-            count = math.floor(rho * len(scene))
+            count = cvtgs.target_count(len(scene), rho)
             small = {text: simplified(scene, count, how) for text, how in VARIANTS.items()}
             small["mass pruning"] = keep_most_mass(scene, count)
             scores = score_views(scene, small, cameras).values()
