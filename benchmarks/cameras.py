@@ -57,12 +57,15 @@ def cameras_beside(scene: Path, *, size: int | None = None) -> Cameras:
     path = cameras_file(scene)
     if not path.is_file():
         raise SystemExit(f"{scene}: needs cameras beside it in {path.name}, found none.")
-    found = json.loads(path.read_text(encoding="utf-8"))
-    viewmats = torch.tensor(found["world_to_camera"], dtype=torch.float64)
-    intrinsics = torch.tensor(found["K"], dtype=torch.float64).expand(len(viewmats), 3, 3)
-    cameras = Cameras(
-        viewmats=viewmats, Ks=intrinsics, width=found["width"], height=found["height"]
-    )
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        width, height = found["width"], found["height"]
+        viewmats = torch.tensor(found["world_to_camera"], dtype=torch.float64)
+        intrinsics = torch.tensor(found["K"], dtype=torch.float64).expand(len(viewmats), 3, 3)
+    except (KeyError, RuntimeError, TypeError, ValueError):
+        wanted = "width, height, K and world_to_camera"
+        raise SystemExit(f"{path}: must have {wanted}; found another format.") from None
+    cameras = Cameras(viewmats=viewmats, Ks=intrinsics, width=width, height=height)
     return cameras if size is None else cameras.fitted(size)
 
 

@@ -143,6 +143,13 @@ def test_a_scene_without_cameras_is_refused_by_name(tmp_path):
         camera_files.cameras_beside(tmp_path / "other.ply")
 
 
+@pytest.mark.parametrize("text", ["[]", "{}", "no JSON", '{"K": 1, "width": 1, "height": 1}'])
+def test_cameras_of_another_format_are_refused_by_name(tmp_path, text):
+    (tmp_path / "a.cameras.json").write_text(text)
+    with pytest.raises(SystemExit, match=r"a\.cameras\.json: must have width, height, K and world"):
+        camera_files.cameras_beside(tmp_path / "a.ply")
+
+
 @pytest.mark.parametrize("words", [["--rho", "2"], ["--set", "nonsense=1"]])
 def test_mistakes_are_found_before_anything_is_measured(tmp_path, capsys, words):
     cvtgs.save(SCENE, tmp_path / "thing.ply")
