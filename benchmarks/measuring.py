@@ -23,12 +23,12 @@ from cvtgs.tradeoff.process_cost import run_process
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cost:
-    """Cost of one process, its children not included.
+    """Cost of one process and of those that it started and waited for.
 
     Attributes:
         user_seconds: User CPU time.
         wall_seconds: Wall-clock time from start to end.
-        peak_bytes: Peak resident size.
+        peak_bytes: Peak resident size, of the largest of them.
         output: Its stdout.
         system: The machine, and the version of cvtgs; empty if unknown.
     """
@@ -114,7 +114,7 @@ def generated_scenes(
 
 
 def names_of(files: Sequence[Path]) -> list[str]:
-    """Return a name for each file: its stem, after as many folders as tell it from the others.
+    """Return a name for each file: its stem, or its last folders and whole name where stems agree.
 
     Raises:
         SystemExit: A file is given twice, or two names would be the same.
