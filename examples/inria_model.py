@@ -20,6 +20,8 @@ def main() -> None:
     parser.add_argument("output", type=Path)
     parser.add_argument("--rho", type=float, default=0.1)
     options = parser.parse_args()
+    if not options.model.is_dir():
+        parser.error(f"model must be a folder; found {options.model}.")
     scene_file = cvtgs.io.scene_file(options.model)
     small = cvtgs.Simplifier().simplify(cvtgs.load(scene_file), options.rho)
     target = options.output / scene_file.relative_to(options.model)

@@ -65,6 +65,12 @@ def test_inria_model(tmp_path: Path) -> None:
     assert (small / "cfg_args").is_file()
 
 
+def test_inria_model_needs_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(subprocess.CalledProcessError) as caught:
+        run("inria_model.py", scene_file(tmp_path / "scene.ply", 20), tmp_path / "small")
+    assert f"model must be a folder; found {tmp_path / 'scene.ply'}." in caught.value.stderr
+
+
 @pytest.mark.slow
 def test_simplify(tmp_path: Path) -> None:
     source, small = scene_file(tmp_path / "scene.ply"), tmp_path / "small.ply"
