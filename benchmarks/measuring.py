@@ -57,7 +57,7 @@ def run(command: Sequence[str]) -> Cost:
         wall_seconds=cost.wall_seconds,
         peak_bytes=cost.peak_memory_bytes,
         output=cost.output,
-        system=f"{machine()}, cvtgs {cvtgs.__version__}",
+        system=system(),
     )
 
 
@@ -99,6 +99,11 @@ def machine() -> str:
     """Return the names of processor and Python."""
     model = device_name(torch.device("cpu"))
     return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}"
+
+
+def system() -> str:
+    """Return the machine and the version of cvtgs."""
+    return f"{machine()}, cvtgs {cvtgs.__version__}"
 
 
 def generated_scenes(

@@ -40,7 +40,7 @@ from benchmarks.datasets import (
     find_captures,
     read_test_views,
 )
-from benchmarks.measuring import Cost, digest_of, write_file
+from benchmarks.measuring import Cost, digest_of, system, write_file
 from benchmarks.quality import RATIOS, PhotographJudge, markdown_rows
 from benchmarks.worlds import place_cameras
 from cvtgs.errors import CvtgsError
@@ -179,7 +179,7 @@ def measure(
         file=sys.stderr,
     )
     if not has_full:
-        nothing = Cost(user_seconds=0.0, wall_seconds=0.0, peak_bytes=0, output="")
+        nothing = Cost(user_seconds=0.0, wall_seconds=0.0, peak_bytes=0, output="", system=system())
         full = result_of(judge, (scene, nothing), wanted=len(scene), source=source)
         yield one_row(capture, FULL, 1.0, full)
     for method, rho in todo:
