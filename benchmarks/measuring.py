@@ -8,7 +8,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,7 +48,8 @@ def run_python(*arguments: str) -> Cost:
 def run(command: Sequence[str]) -> Cost:
     """Run a command and measure it; a failure ends the benchmark."""
     try:
-        cost = run_process(command)
+        with importable() if command[0] == sys.executable else nullcontext():
+            cost = run_process(command)
     except RunError as error:
         raise SystemExit(f"{' '.join(command)} failed: {error}") from None
     sys.stderr.write(cost.errors)
@@ -59,6 +60,20 @@ def run(command: Sequence[str]) -> Cost:
         output=cost.output,
         system=system(),
     )
+
+
+@contextmanager
+def importable() -> Iterator[None]:
+    """Let child processes import benchmarks; they do not look in the current folder."""
+    before = os.environ.get("PYTHONPATH")
+    root = str(Path(__file__).parents[1])
+    os.environ["PYTHONPATH"] = root if before is None else os.pathsep.join([before, root])
+    try:
+        yield
+    finally:
+        del os.environ["PYTHONPATH"]
+        if before is not None:
+            os.environ["PYTHONPATH"] = before
 
 
 @contextmanager
