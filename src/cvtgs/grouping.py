@@ -27,6 +27,9 @@ COLOR_CELLS = 10_000  # the number of cells at which ``cvt.color`` applies uncha
 FULL_RELIEF = 0.1
 """Ratio of cells to Gaussians from which on ``allocation.far_relief`` applies unchanged."""
 
+FULL_GAIN = 0.4
+"""Strength of the effect unbounded from which on ``allocation.far_gain`` applies unchanged."""
+
 NEAR = 6  # number of neighbouring cells whose errors count, by half, for a cell
 SMALL_ERROR = 0.02  # share of the mean error that is added to those of all cells
 LARGEST_FACTOR = 12.0  # limit of the factors on masses, and of their inverse
@@ -202,7 +205,7 @@ def allocate(
     if count == target and (is_own or not config.reassign):
         return labels
     members = points.moments or row_moments(points, analysis, config)
-    config = allocation_at(target / len(labels), config)
+    config = allocation_at(target / len(labels), config, unbounded=analysis.plan.unbounded.strength)
     groups = members if is_own else cells.group_moments(members, labels, count)
     merged = torch.arange(count, device=labels.device)
     if count > target:
@@ -210,7 +213,8 @@ def allocate(
         neighbors = points.neighbors if is_own else None
         if neighbors is None:
             neighbors = cvt.nearest_neighbors(groups.means.T, config.neighbors)
-        merged = cells.merge_pairs(groups, neighbors, target, config)
+        area = float(points.apparent_masses.double().sum()) / analysis.frame.radius**2
+        merged = cells.merge_pairs(groups, neighbors, target, config, area=area)
         groups = cells.group_moments(groups, merged, target)
     if not config.reassign:
         return merged.to(labels.device).index_select(0, labels)
@@ -268,11 +272,14 @@ def most_cells(target: int, total: int, config: AllocationConfig) -> int:
     return min(total, MEMBERS_PER_CELL * math.ceil(config.oversampling * target))
 
 
-def allocation_at(ratio: float, config: AllocationConfig) -> AllocationConfig:
-    """Return the weights of the costs at a ratio of cells to Gaussians."""
-    color = config.color * ratio**config.color_power
-    relief = config.far_relief * min(1.0, ratio / FULL_RELIEF)
-    return config.model_copy(update={"color": color, "far_relief": relief})
+def allocation_at(ratio: float, config: AllocationConfig, *, unbounded: float) -> AllocationConfig:
+    """Return the weights of the costs at a ratio, and a strength of the effect unbounded."""
+    update = {
+        "color": config.color * ratio**config.color_power,
+        "far_relief": config.far_relief * min(1.0, ratio / FULL_RELIEF),
+        "far_gain": config.far_gain ** min(1.0, unbounded / FULL_GAIN),
+    }
+    return config.model_copy(update=update)
 
 
 def curve_order(

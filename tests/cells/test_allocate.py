@@ -300,8 +300,8 @@ def test_without_allocation_the_cells_of_the_tessellation_are_kept():
 
 def test_colours_count_more_where_cells_are_small():
     config = AllocationConfig(color=100.0, color_power=0.5)
-    assert allocation_at(0.25, config).color == pytest.approx(50.0)
-    assert allocation_at(0.01, config).color == pytest.approx(10.0)
+    assert allocation_at(0.25, config, unbounded=0.0).color == pytest.approx(50.0)
+    assert allocation_at(0.01, config, unbounded=0.0).color == pytest.approx(10.0)
 
 
 def test_contrast_is_that_of_neighbours_by_hand():
@@ -381,8 +381,8 @@ def test_far_mass_lowers_the_power_of_masses(monkeypatch):
 
 def test_far_mass_counts_less_below_a_tenth():
     config = AllocationConfig(far_relief=0.5)
-    found = [allocation_at(ratio, config).far_relief for ratio in (0.3, 0.1, 0.05, 0.001)]
-    assert found == pytest.approx([0.5, 0.5, 0.25, 0.005])
+    found = [allocation_at(rho, config, unbounded=1.0).far_relief for rho in (0.3, 0.05, 0.001)]
+    assert found == pytest.approx([0.5, 0.25, 0.005])
 
 
 def test_large_groups_merge_last():

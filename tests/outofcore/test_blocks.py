@@ -168,9 +168,9 @@ def test_costs_are_those_of_a_run_in_one_piece(scene, tmp_path, monkeypatch):
     """Their weights depend on the ratio of cells to Gaussians that are not too faint to keep."""
     ratios = []
 
-    def noted(ratio, config):
+    def noted(ratio, *rest, **named):
         ratios.append(ratio)
-        return grouping.allocation_at(ratio, config)
+        return grouping.allocation_at(ratio, *rest, **named)
 
     monkeypatch.setattr("cvtgs.outofcore.allocate.allocation_at", noted)
     faint = torch.arange(6000) % 2 == 0

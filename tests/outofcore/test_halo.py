@@ -218,12 +218,14 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
         apparent_masses=torch.cat(areas) * scene.opacities,
         components=job.read_scan().view_components,
     )
-    config = allocation_at(TARGET / COUNT, job.config.allocation)
+    scan, masses = job.read_scan(), torch.cat(areas).double() * scene.opacities
+    unbounded, area = scan.plan.unbounded.strength, float(masses.sum()) / scan.frame.radius**2
+    config = allocation_at(TARGET / COUNT, job.config.allocation, unbounded=unbounded)
     fine = sum(job.cells)
     assert fine > TARGET + 50
     whole = cells.group_moments(members, labels, fine)
     near = cvt.nearest_neighbors(whole.means.T, config.neighbors)
-    merged = cells.merge_pairs(whole, near, TARGET, config)
+    merged = cells.merge_pairs(whole, near, TARGET, config, area=area)
     wanted = cells.group_moments(whole, merged, TARGET)
     found = torch.cat([job.read("groups", block)["means"] for block in job.blocks_with_cells()], 1)
     torch.testing.assert_close(in_order(found), in_order(wanted.means))

@@ -284,6 +284,22 @@ def far_share(distances: Float[Tensor, "n"], masses: Float[Tensor, "n"]) -> Floa
     return divide((masses * (distances > UNBOUNDED_DISTANCE)).sum(), masses.sum()).double()
 
 
+def far_visibility(share: float, area: float) -> float:
+    """Return how much of the far mass is visible, relative to how much of the near mass is.
+
+    Mass hides mass behind it: ``(1 - exp(-x)) / x`` of ``x`` layers is visible. Far mass lies
+    around the scene, near mass on a disc of one robust radius.
+
+    Args:
+        share: Share of far mass.
+        area: All mass, in squared robust radii.
+    """
+    area = min(area, 1e30)
+    layers = area * share / (4.0 * math.pi), area * (1.0 - share) / math.pi
+    far, near = (-math.expm1(-x) / x if x > 0.0 else 1.0 for x in layers)
+    return far / near
+
+
 def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) -> Float[Tensor, ""]:
     """Return the share of Gaussians that repeat exactly the position and colour of another.
 

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.analysis.effects import far_share
-from cvtgs.cells.moments import UPPER, Moments
+from cvtgs.analysis.effects import far_share, far_visibility
+from cvtgs.cells.moments import UPPER, Moments, join_pairs, joint_covariances, take_moments
 from cvtgs.checks import checked
 from cvtgs.config import AllocationConfig
 from cvtgs.counts import checked_whole
@@ -32,15 +32,13 @@ flat Gaussians, which images hardly show, counts less than their extent."""
 FLOOR = 1e-4
 """Standard deviation, in robust radii, added in quadrature so that flat shapes have a volume."""
 
-COMMON_CONTRAST = 0.2
-"""Contrast of neighbours, in units of RGB, for which weights of costs are given."""
-
-LEAST_CONTRAST, LARGEST_CONTRAST = 0.3, 1.4
-"""Limits of the contrast in weights, in units of the common one."""
-
+COMMON_CONTRAST = 0.2  # of neighbours, in units of RGB, for which weights of costs are given
+LEAST_CONTRAST, LARGEST_CONTRAST = 0.3, 1.4  # limits in weights, in units of the common one
 MOSTLY_FAR = 0.3  # share of far mass from which on the limit of heavy pairs applies in full
-
 VIEWERS = 3.0  # distance from the middle of the scene, in robust radii, from which it is often seen
+
+LEAST_VISIBLE, MOST_VISIBLE = 1.5, 2.5
+"""Far mass this many times as visible as near mass begins to count more; counts most."""
 
 SAMPLE = 1 << 16
 """Number of groups from which on only some of them are used to measure the contrast."""
@@ -58,7 +56,12 @@ class Heavy(NamedTuple):
 
 @checked
 def merge_pairs(
-    groups: Moments, neighbors: Int[Tensor, "m k"], count: int, config: AllocationConfig
+    groups: Moments,
+    neighbors: Int[Tensor, "m k"],
+    count: int,
+    config: AllocationConfig,
+    *,
+    area: float | None = None,
 ) -> Int[Tensor, "m"]:
     """Merge neighbouring groups in pairs, cheapest first, until ``count`` are left.
 
@@ -66,14 +69,17 @@ def merge_pairs(
     Gaussian, plus the squared colour distance, times a power of the mass as seen in images, times
     the number of Gaussians, which keeps groups balanced. The contrast of neighbouring groups
     scales the power and the weight of colour; far mass lowers the power. Pairs that would be seen
-    at a wide angle cost more, and so do heavy ones where much mass is far. Where no neighbours are
-    left to merge, groups of adjacent rows do.
+    at a wide angle cost more, and so do heavy ones where much mass is far, and far ones where less
+    of the far mass is hidden than of the near mass. Where no neighbours are left to merge, groups
+    of adjacent rows do.
 
     Args:
         groups: Moments of the groups.
         neighbors: Groups that each group may merge with.
         count: Number of groups to keep, 1 to m.
         config: Weights of the cost.
+        area: Apparent mass of all groups, squared robust radii; None if it is not known, and far
+            mass is taken to be as hidden as near mass.
 
     Returns:
         The new group of every group, 0 to ``count - 1``.
@@ -92,9 +98,13 @@ def merge_pairs(
     """
     count = checked_whole(count, "count", most=len(groups.masses), things="groups")
     contrast = _relative_contrast(groups.colors, neighbors)
-    masses = groups.apparent_masses
-    share = far_share(torch.linalg.vector_norm(groups.means, dim=0), masses)
-    far, mass = torch.stack([share, masses.double().sum()]).tolist()
+    masses, distances = groups.apparent_masses, torch.linalg.vector_norm(groups.means, dim=0)
+    far, mass = torch.stack([far_share(distances, masses), masses.double().sum()]).tolist()
+    gain = _far_gain(far, area, config)
+    if gain > 1.0:
+        outer = (2.0 * (distances - VIEWERS) + 1.0).clamp(0.0, 1.0)
+        groups = groups._replace(apparent_masses=masses * gain**outer)
+        mass *= 1.0 - far + far * gain
     update = {
         "color": config.color / contrast,
         "mass_power": config.mass_power * contrast * (1.0 - config.far_relief * far),
@@ -120,11 +130,20 @@ def merge_pairs(
         target[merged] = target[kept]
         labels, total = target.index_select(0, labels), total - len(merged)
         if total > count:
-            _join_pairs(table, kept, merged)
+            join_pairs(table, kept, merged)
             table = table.index_select(1, is_kept.nonzero()[:, 0])
             del pairs, costs  # frees memory
             pairs = _distinct_pairs(target.index_select(0, first), target.index_select(0, second))
     return labels
+
+
+def _far_gain(share: float, area: float | None, config: AllocationConfig) -> float:
+    """Return the factor on far masses: above 1 if less of them is hidden than of near masses."""
+    if share == 0.0 or area is None:
+        return 1.0
+    visible = far_visibility(share, area) - LEAST_VISIBLE
+    strength = min(1.0, max(0.0, visible / (MOST_VISIBLE - LEAST_VISIBLE)))
+    return float(config.far_gain**strength)
 
 
 def _relative_contrast(colors: Float[Tensor, "3 m"], neighbors: Int[Tensor, "m k"]) -> float:
@@ -161,11 +180,6 @@ def _distinct_pairs(first: Tensor, second: Tensor) -> Int[Tensor, "q"]:
     return keys.index_select(0, is_new.nonzero()[:, 0])
 
 
-def _take(table: Float[Tensor, "c n"], groups: Int[Tensor, "k"]) -> Moments:
-    """Return the moments of some groups; those of one number per group have two dimensions."""
-    return Moments(*table.index_select(1, groups).split([1, 1, 1, 3, 6, 3, len(table) - 15]))
-
-
 def _pair_costs(
     table: Float[Tensor, "c n"],
     first: Tensor,
@@ -178,10 +192,10 @@ def _pair_costs(
 
     def costs_of(part: slice) -> Tensor:
         i, j = first[part], second[part]
-        one, two = _take(table, i), _take(table, j)
+        one, two = take_moments(table, i), take_moments(table, j)
         share = one.masses / (one.masses + two.masses)
         own = share * volumes.index_select(0, i) + (1.0 - share) * volumes.index_select(0, j)
-        joint = _joint_covariances(one, two, share)
+        joint = joint_covariances(one, two, share)
         cost = 0.5 * (_log_volume(joint) - own)
         squares = (one.colors - two.colors).square().sum(0)
         squares += config.view_color * (one.view_colors - two.view_colors).square().sum(0)
@@ -210,37 +224,6 @@ def _fog_factor(
     width = (xx + yy + zz) / (means.square().sum(0) + VIEWERS**2)
     factors: Tensor = 1.0 + (width / widest**2).square().square()
     return factors
-
-
-def _joint_covariances(
-    one: Moments, two: Moments, share: Float[Tensor, "1 n"]
-) -> Float[Tensor, "6 n"]:
-    """Return the covariances of pairs, given the share of the first group in the mass."""
-    rest, shifts = 1.0 - share, one.means - two.means
-    spread = share * rest * shifts
-    products = torch.cat([spread[k] * shifts[k:] for k in range(3)])
-    return (share * one.covariances).add_(rest * two.covariances).add_(products)
-
-
-def _join_pairs(table: Float[Tensor, "c n"], first: Int[Tensor, "k"], second: Tensor) -> None:
-    """Replace the moments of the first groups by those of both of each pair, in place."""
-
-    def join(part: slice) -> None:
-        one, two = _take(table, first[part]), _take(table, second[part])
-        masses = one.masses + two.masses
-        share = one.masses / masses
-        both = Moments(
-            counts=one.counts + two.counts,
-            masses=masses,
-            apparent_masses=one.apparent_masses + two.apparent_masses,
-            means=torch.lerp(two.means, one.means, share),
-            covariances=_joint_covariances(one, two, share),
-            colors=torch.lerp(two.colors, one.colors, share),
-            view_colors=torch.lerp(two.view_colors, one.view_colors, share),
-        )
-        table.index_copy_(1, first[part], torch.cat(both))
-
-    in_chunks(join, len(first), CHUNK, table.device)
 
 
 def _log_volume(covariances: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:

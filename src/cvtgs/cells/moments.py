@@ -175,6 +175,42 @@ def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Mom
     return Moments(counts, masses, apparent_masses, means, covariances, colors, varying)
 
 
+def take_moments(table: Float[Tensor, "c n"], groups: Int[Tensor, "k"]) -> Moments:
+    """Return some columns of a table of moments; those of one number each have two dimensions."""
+    return Moments(*table.index_select(1, groups).split([1, 1, 1, 3, 6, 3, len(table) - 15]))
+
+
+def joint_covariances(
+    one: Moments, two: Moments, share: Float[Tensor, "1 n"]
+) -> Float[Tensor, "6 n"]:
+    """Return the covariances of pairs, given the share of the first group in the mass."""
+    rest, shifts = 1.0 - share, one.means - two.means
+    spread = share * rest * shifts
+    products = torch.cat([spread[k] * shifts[k:] for k in range(3)])
+    return (share * one.covariances).add_(rest * two.covariances).add_(products)
+
+
+def join_pairs(table: Float[Tensor, "c n"], first: Int[Tensor, "k"], second: Tensor) -> None:
+    """Replace the moments of the first groups by those of both of each pair, in place."""
+
+    def join(part: slice) -> None:
+        one, two = take_moments(table, first[part]), take_moments(table, second[part])
+        masses = one.masses + two.masses
+        share = one.masses / masses
+        both = Moments(
+            counts=one.counts + two.counts,
+            masses=masses,
+            apparent_masses=one.apparent_masses + two.apparent_masses,
+            means=torch.lerp(two.means, one.means, share),
+            covariances=joint_covariances(one, two, share),
+            colors=torch.lerp(two.colors, one.colors, share),
+            view_colors=torch.lerp(two.view_colors, one.view_colors, share),
+        )
+        table.index_copy_(1, first[part], torch.cat(both))
+
+    in_chunks(join, len(first), CHUNK, table.device)
+
+
 @one_thread()
 @checked
 def view_components(

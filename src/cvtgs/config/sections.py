@@ -91,8 +91,7 @@ class TessellationConfig(Section):
             power: 0 gives the opacity alone, 1 the mass.
         perspective: Whether areas shrink with the distance from the middle of the scene, as they
             do in an image.
-        hidden_share: Factor on the area of a fully enclosed Gaussian, where a free one has 1; with
-            1, enclosure is ignored.
+        hidden_share: Factor on the area of a fully enclosed Gaussian; 1 ignores enclosure.
         weight_floor: Smallest weight of a Gaussian, as a share of the mean weight.
         color: Length of one unit of colour, in robust radii, at 10,000 cells; 0 groups by position
             alone.
@@ -128,8 +127,7 @@ class AllocationConfig(Section):
             at one cell per Gaussian; in inverse proportion to the contrast over 0.2. This is the
             root of half the mean squared colour distance of neighbours, limited to 0.06 to 0.28.
         color_power: This weight is proportional to the ratio of cells to Gaussians to this power.
-        view_color: Weight of view-dependent colours in this distance, as far as neighbours have
-            them in common (:func:`cvtgs.cells.view_components`); 0 leaves them out.
+        view_color: Weight of view-dependent colours in it, if neighbours share them; 0 for none.
         mass_power: The cost of a pair is multiplied by its apparent mass to this power, at a
             contrast of 0.2; the power is in proportion to the contrast.
         far_relief: Share by which ``mass_power`` is reduced where all mass lies beyond three robust
@@ -140,6 +138,7 @@ class AllocationConfig(Section):
             merged skies do not become fog; 0 sets no limit.
         heaviest: Apparent mass of a pair, in mean cells, around which merging begins to cost more
             in scenes with far mass: for walls and skies of few Gaussians; 0 sets no limit.
+        far_gain: Factor on far masses in these costs if less of them is hidden than of near ones.
         reassign: Whether every Gaussian then moves to the cell that explains it best.
     """
 
@@ -152,6 +151,7 @@ class AllocationConfig(Section):
     far_relief: Share = 0.55
     widest: Factor = 0.55
     heaviest: Factor = 20.0
+    far_gain: float = pydantic.Field(default=9.0, ge=1.0, le=1e6)
     reassign: bool = True
 
     @property

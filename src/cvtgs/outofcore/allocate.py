@@ -109,7 +109,9 @@ def _allocate_region(
     labels = torch.arange(len(fine.masses))
     if len(labels) > count:
         near = cvt.nearest_neighbors(fine.means.T, config.neighbors)
-        labels = cells.merge_pairs(fine, near, count, config)
+        scan = job.read_scan()
+        area = float(fine.apparent_masses.double().sum()) * scan.mass_unit / scan.frame.radius**2
+        labels = cells.merge_pairs(fine, near, count, config, area=area)
     order, offsets = sort_by_label(labels, count)
     heaviest = order[segment_argmax(fine.masses[order], offsets)]
     owners = torch.repeat_interleave(torch.arange(len(region)), sizes)[heaviest]
@@ -136,7 +138,9 @@ def _allocate_region(
 def _costs(job: Job) -> AllocationConfig:
     """Return the costs of merging at the ratio of the whole scene."""
     manifest = job.read_manifest()
-    return allocation_at(manifest.total / manifest.grouped, job.config.allocation)
+    ratio = manifest.total / manifest.grouped
+    unbounded = job.read_scan().plan.unbounded.strength
+    return allocation_at(ratio, job.config.allocation, unbounded=unbounded)
 
 
 def _add_parts(job: Job, region: Sequence[int], cell_counts: Sequence[int]) -> Moments:
