@@ -84,7 +84,7 @@ class EffectPlan(Record):
         sh: View-dependent colour: SH bands above the constant one are computed.
         mip: The scene is rendered with the compensation of Mip-Splatting, and its cells are merged
             for it.
-        unbounded: Part of the mass is far away: far positions are contracted.
+        unbounded: Part of the mass is far: its positions are contracted, and visible masses raised.
         haze: Faint Gaussians hold mass: only the faintest are dropped.
         flat: Gaussians have two scales (2DGS), and none gets a third.
         duplicates: Gaussians share positions: the nearest site is searched once per position.

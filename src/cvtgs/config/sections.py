@@ -44,7 +44,7 @@ class EffectsConfig(Section):
             Bands above it are written as zeros.
         mip: Whether a scene with the Mip-Splatting tag is rendered with the compensation of
             Mip-Splatting, and its cells are merged for it. The result keeps the tag in any case.
-        unbounded: Whether far positions are contracted, if there are any.
+        unbounded: Whether far positions are contracted, and visible far masses raised, if any.
         haze: Whether faint Gaussians are kept by their mass; ``off`` drops all of them.
         flat: Whether a scene of Gaussians with two scales (2DGS) keeps two scales.
         duplicates: Whether Gaussians at exactly the same position share one search.
