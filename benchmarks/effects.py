@@ -37,6 +37,7 @@ from cvtgs.tags import ANTIALIASED
 from cvtgs.views import automatic_views
 
 LOOK = {"visibility": {"views": 8}}
+FAINT = {"filter": {"min_opacity": 0.1}}  # generated haze has opacities above the default
 
 
 class Case(NamedTuple):
@@ -64,7 +65,7 @@ def tagged(count: int) -> GaussianScene:
 
 def without_faint(count: int) -> GaussianScene:
     scene = make("room", count, sh_degree=0, seed=0)
-    return scene.select(scene.opacities >= SimplifyConfig().filter.min_opacity)
+    return scene.select(scene.opacities >= FAINT["filter"]["min_opacity"])
 
 
 def surfels(count: int) -> GaussianScene:
@@ -106,7 +107,7 @@ CASES: Mapping[str, Case] = {
     "sh": Case(generated("courtyard", 3), without_bands),
     "mip": Case(tagged, generated("thin"), settings=LOOK),
     "unbounded": Case(generated("landscape"), generated("object")),
-    "haze": Case(generated("haze"), without_faint),
+    "haze": Case(generated("haze"), without_faint, settings=FAINT),
     "flat": Case(surfels, generated("object"), on="auto"),
     "duplicates": Case(repeated, generated("courtyard")),
     "clamping": Case(darkened, generated("courtyard", 1)),
