@@ -91,12 +91,8 @@ def stage_table(device: torch.device, counts: Sequence[int], *, rho: float, runs
             scene, SimplifyConfig(), rho, device=torch.device("cpu"), runs=runs
         )
         lines.append(row(count, "copy", statistics.median(moved[1:]), None, None))
-        medians, peaks, on_host = (
-            stage_seconds(reports),
-            stage_peaks(reports),
-            stage_seconds(others),
-        )
-        for stage, found in medians.items():
+        peaks, on_host = stage_peaks(reports), stage_seconds(others)
+        for stage, found in stage_seconds(reports).items():
             lines.append(row(count, stage, found, peaks[stage], on_host[stage]))
         same = all(equal(small[0], one) for one in small[1:])
         found, wanted = (

@@ -9,7 +9,7 @@ import torch
 
 from cvtgs import Simplifier, concatenate, load, save
 from cvtgs.analysis import analyze
-from cvtgs.analysis.effects import far_share, far_visibility
+from cvtgs.analysis.effects import far_visibility
 from cvtgs.cells import Moments, merge_pairs
 from cvtgs.config import AllocationConfig, SimplifyConfig
 from cvtgs.grouping import FULL_GAIN, allocation_at
@@ -72,11 +72,21 @@ def test_lighter_far_groups_merge_first_otherwise(options: dict[str, float]):
     assert merged_pair(0.5, **options) == [2, 3]
 
 
-def test_most_mass_far_away_is_hidden_by_itself():
-    assert merged_pair(0.9, gain=9.0, area=1000.0) == [0, 1]
-    layers = torch.tensor([1.0, 30.0])  # shares of near and far mass
-    share = float(far_share(torch.tensor([0.0, 6.0]), layers))
-    assert far_visibility(share, 1000.0) < 1.0
+@pytest.mark.parametrize(
+    ("share", "gain"),
+    [
+        (0.5, 9.0),  # four times as visible as near mass
+        (2.0 / 3.0, 3.0),  # twice
+        (0.8, 1.0),  # as visible
+        (0.97, 1.0),  # far mass hides itself
+        (0.0, 1.0),
+    ],
+)
+def test_the_gain_depends_on_how_visible_far_mass_is(share: float, gain: float):
+    found = merge_pairs.__wrapped__.__globals__["_far_gain"]
+    config = AllocationConfig(far_gain=9.0)
+    assert found(share, 1e9, config) == pytest.approx(gain)
+    assert found(share, None, config) == 1.0
 
 
 @pytest.mark.parametrize(
