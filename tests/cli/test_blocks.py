@@ -113,10 +113,13 @@ def test_images_leave_less_memory_for_one_piece(
         workers=1,
         scheduler=None,
         device="auto",
+        target_psnr=None,
+        target_ssim=None,
     )
-    for preset in ("standard", "matched"):
+    for preset, target in (("standard", None), ("matched", None), ("standard", 0.9)):
+        options.target_ssim = target
         assert block_memory(options, cvtgs.SimplifyConfig(preset=preset)) is None
-    assert rooms == [2_000_000_000, 2_000_000_000 - IMAGE_BYTES]
+    assert rooms == [2_000_000_000, *2 * [2_000_000_000 - IMAGE_BYTES]]
 
 
 def test_a_time_budget_chooses_no_preset_whose_images_do_not_fit(
@@ -128,6 +131,17 @@ def test_a_time_budget_chooses_no_preset_whose_images_do_not_fit(
     assert main(words) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert "Preset standard, the best that fits into 3600 s and, without images, into 600MB" in text
+
+
+def test_a_quality_is_not_searched_in_less_memory_than_its_images_need(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cvtgs.save(random_scene(300), tmp_path / "in.ply")
+    words = ["simplify", str(tmp_path / "in.ply"), str(tmp_path / "out.ply"), "--preset", "draft"]
+    words += ["--target-psnr", "12", "--memory"]
+    assert main([*words, "600MB"]) == 1
+    assert "--target-psnr cannot be used with blocks: the" in capsys.readouterr().err
+    assert main([*words, "2GB"]) == 0
 
 
 def test_images_leave_less_memory_for_a_stream_in_one_piece(

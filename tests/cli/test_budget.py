@@ -29,7 +29,7 @@ MODEL = CostModel(rates={"check": {"in": 1e-6}, "refine": {"look_pixels": 2.5e-7
 def options(*words: str) -> argparse.Namespace:
     words = ("in.ply", "out.ply", "--device", "cpu", *words)
     known = build_parser().parse_args(["simplify", *words])
-    known.begun = STARTED
+    known.begun, known.output = STARTED, Path("out.ply")
     return known
 
 
@@ -160,7 +160,8 @@ def test_a_time_budget_chooses_a_preset_and_explains_it(scene):
     assert chosen.reason.startswith("Preset high, the best that fits into 8 s: expected to take 4")
     assert chosen.late_note(8.0) == []
     assert chosen.late_note(44.0) == [
-        "The run took 44.0 s, where 8.0 s were left; --recalibrate measures this machine again."
+        "Simplifying and writing took 44.0 s, where 8.0 s were left; --recalibrate measures this "
+        "machine again."
     ]
 
 
@@ -183,7 +184,7 @@ def test_a_time_budget_accounts_for_the_other_settings(scene, monkeypatch, words
     budget = options("--rho", "0.1", "--time-budget", "5s", *words)
     check_goals(budget)
     if preset is None:
-        ended = r"takes about 200 s .* Starting and reading took 0\.0 of 5 s\.$"
+        ended = r"takes about 200 s .* Of 5 s, starting and reading took 0\.0 s, and writing .*\.$"
         with pytest.raises(GoalError, match=ended):
             choose_preset(budget, scene, settings, silent)
     else:
@@ -206,7 +207,9 @@ def test_the_machine_is_measured_once_or_on_request(scene, measured, capsys):
 @pytest.mark.usefixtures("measured")
 def test_a_budget_shorter_than_start_up_is_refused(scene, monkeypatch):
     monkeypatch.setattr("cvtgs.cli.goals.time.perf_counter", lambda: STARTED + 60)
-    with pytest.raises(GoalError, match=r"fits into 5 s: starting and reading took 60\.0 s\."):
+    with pytest.raises(
+        GoalError, match=r"fits into 5 s: starting and reading took 60\.0 s, and writing"
+    ):
         choose_preset(options("--count", "10", "--time-budget", "5s"), scene, {}, silent)
 
 

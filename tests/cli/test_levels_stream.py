@@ -211,6 +211,40 @@ def test_a_level_does_not_replace_its_scene(tmp_path, capsys):
     assert [one.name for one in tmp_path.iterdir()] == ["rho_0.5.ply"]
 
 
+@pytest.mark.parametrize(("kind", "chunk"), [("sog", "0_0_0"), ("3dtiles", "0_0.glb")])
+def test_a_stream_does_not_replace_its_scene(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, chunk: str
+) -> None:
+    path, out = tmp_path / "a.ply", tmp_path / "out"
+    save(random_scene(300), path)
+    words = ["-o", str(out), "--stream", kind, "--preset", "draft", "--rho", "1,0.1"]
+    assert main(["levels", str(path), *words]) == 0
+    before = {one: one.read_bytes() for one in out.rglob("*") if one.is_file()}
+    sources = {chunk: out / chunk}
+    if kind == "sog":
+        sources["lod-meta.json"] = out
+    for name, source in sources.items():
+        assert main(["levels", str(source), *words, "--overwrite"]) == 1
+        error = " ".join(capsys.readouterr().err.split())
+        assert f"{out / name}: a level must not replace the scene; choose another folder." in error
+    assert before == {one: one.read_bytes() for one in out.rglob("*") if one.is_file()}
+    beside = out / "b.ply"
+    path.rename(beside)
+    assert main(["levels", str(beside), *words, "--overwrite"]) == 0
+    assert beside.exists()
+
+
+@pytest.mark.parametrize(("count", "levels"), [(1, [1]), (2, [2, 1]), (10, [10, 3, 1])])
+def test_the_levels_of_a_small_stream_differ_in_size(
+    tmp_path: Path, count: int, levels: list[int]
+) -> None:
+    path, out = tmp_path / "a.ply", tmp_path / "out"
+    save(random_scene(count), path)
+    words = ["levels", str(path), "-o", str(out), "--stream", "sog", "--preset", "draft"]
+    assert main(words) == 0
+    assert [len(load(out, lod=lod)) for lod in range(len(levels))] == levels
+
+
 def test_a_page_shows_a_scene_that_is_named_like_a_level(tmp_path, monkeypatch):
     path, shown = tmp_path / "rho_0.5.ply", {}
     save(random_scene(30), path)

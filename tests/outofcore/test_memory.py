@@ -235,6 +235,22 @@ def test_blocks_need_the_least_memory(tmp_path: Path) -> None:
             simplify_file(tmp_path / "a.ply", tmp_path / "b.ply", 0.1, memory=wrong, blocks=2)
 
 
+def test_formats_that_are_written_from_memory_say_what_they_need(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = tmp_path / "in.ply"
+    cvtgs.save(cvtgs.synthetic.scene("object", 3000, sh_degree=0, seed=0), source)
+    row = open_rows(source).dtype.itemsize
+    for name, rows, warns in (("a.sog", 4, True), ("b.sog", 6, False), ("a.ply", 4, False)):
+        monkeypatch.setattr("cvtgs.outofcore.memory.LIBRARY_BYTES", LEAST_BYTES - 300 * rows * row)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            simplify_file(source, tmp_path / name, count=300, memory=LEAST_BYTES, blocks=2)
+        found = [str(one.message) for one in caught if "written all at once" in str(one.message)]
+        assert len(found) == warns
+        assert all("a.sog: " in text and "for 300 Gaussians, more than" in text for text in found)
+
+
 def test_reclaimable_pages_give_no_room_above_the_limit(tmp_path):
     """The statistics are read after the use, so they may name more than was used."""
     for name, text in {

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from cvtgs.simplifier import Simplifier
 
 STARTED = time.perf_counter()  # approximate start of this process, from which a time budget counts
+SAMPLED = 1 << 14  # Gaussians that tell how long the output file takes
 
 
 class ChosenPreset(NamedTuple):
@@ -35,8 +36,8 @@ class ChosenPreset(NamedTuple):
     advice: str
 
     def late_note(self, seconds: float) -> list[str]:
-        """Return a sentence if a run took longer than the time that was left."""
-        took = f"The run took {seconds:.1f} s, where {self.left:.1f} s were left"
+        """Return a sentence if a run and its file took longer than the time that was left."""
+        took = f"Simplifying and writing took {seconds:.1f} s, where {self.left:.1f} s were left"
         return [f"{took}; {self.advice}."] if seconds > self.left else []
 
 
@@ -94,14 +95,14 @@ def choose_preset(
     """Choose the best preset that fits into the remaining time budget, and into memory."""
     from cvtgs.budget.calibrate import is_calibrated
 
-    budget, spent = options.time_budget, time.perf_counter() - options.begun
-    if budget <= spent:
-        raise GoalError(
-            f"no preset fits into {budget:g} s: starting and reading took {spent:.1f} s."
-        )
     target = cvtgs.target_count(
         len(scene), options.rho, count=options.count, max_count=options.max_count
     )
+    budget, writing = options.time_budget, _seconds_to_write(options, scene, target)
+    spent = time.perf_counter() - options.begun
+    parts = f"starting and reading took {spent:.1f} s, and writing takes about {writing:.1f} s"
+    if budget <= spent + writing:
+        raise GoalError(f"no preset fits into {budget:g} s: {parts}.")
     if options.shipped_rates:
         model = cvtgs.budget.shipped_model()
     else:
@@ -114,24 +115,33 @@ def choose_preset(
         model = cvtgs.budget.cost_model(options.device, recalibrate=again, listener=listener)
     if options.ckpt == "none":
         settings = {**settings, "merge.network": "false"}
-    work = cvtgs.budget.Work.of(scene, target)
+    work, left = cvtgs.budget.Work.of(scene, target), budget - spent - writing
     try:
         choice = cvtgs.budget.choose_preset(
-            work, budget - spent, settings=settings, model=model, with_images=with_images
+            work, left, settings=settings, model=model, with_images=with_images
         )
     except GoalError as error:
-        raise GoalError(
-            f"{error} Starting and reading took {spent:.1f} of {budget:g} s."
-        ) from error
+        raise GoalError(f"{error} Of {budget:g} s, {parts}.") from error
     room = "" if with_images else f" and, without images, into {options.memory}"
     reason = (
         f"Preset {choice.preset}, the best that fits into {budget:g} s{room}: expected to take "
-        f"{choice.seconds:.1f} s after {spent:.1f} s of starting and reading."
+        f"{choice.seconds:.1f} s; {parts}."
     )
     advice = "--recalibrate measures this machine again"
     if options.shipped_rates:
         advice = "without --shipped-rates, this machine is measured"
     return ChosenPreset(choice.preset, reason, budget - spent, advice)
+
+
+def _seconds_to_write(options: argparse.Namespace, scene: "GaussianScene", count: int) -> float:
+    """Estimate the seconds that a scene of some Gaussians takes to write in the format of OUT."""
+    with TemporaryDirectory() as folder, without_warnings(DroppedDataWarning):
+        seconds = []
+        for sample in (scene[:1], scene[: min(count, SAMPLED)]):  # the first loads libraries
+            started = time.perf_counter()
+            cvtgs.io.save(sample, Path(folder) / options.output.name, overwrite=True)
+            seconds.append(time.perf_counter() - started)
+    return seconds[0] + seconds[1] * count / len(sample)
 
 
 def search_target(

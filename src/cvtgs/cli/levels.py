@@ -92,8 +92,8 @@ def levels(options: argparse.Namespace) -> None:
     names = cvtgs.levels.level_names(rhos, suffix)
     check_stream_options(options)
     check_page(options)
+    _check_input(options, names)
     if options.stream is None:
-        _check_input(options, names)
         cvtgs.levels.check_levels(options.output, names, overwrite=options.overwrite)
     config = cvtgs.SimplifyConfig.compose(
         file=options.config, preset=preset_of(options), settings=read_settings(options.settings)
@@ -109,6 +109,8 @@ def levels(options: argparse.Namespace) -> None:
             checkpoint, config=config, device=options.device, listener=listener
         )
         scene = cvtgs.load(options.input, axes=axes.source, trust_sizes=options.trust_sizes)
+        if options.stream is not None and options.rho is None:
+            rhos = _of_different_sizes(rhos, len(scene))
         degree = scene.sh_degree if options.sh_degree is None else options.sh_degree
         cameras = _cameras_to_fit(options, scene) if config.uses_images else None
         views = _checked_views(options, scene) if is_scored else None
@@ -150,14 +152,23 @@ def levels(options: argparse.Namespace) -> None:
     write_page(options, {title: scene, **small})
 
 
+def _of_different_sizes(rhos: Sequence[float], total: int) -> list[float]:
+    """Return descending ratios without those whose levels have the size of a larger one."""
+    sizes = {cvtgs.target_count(total, rho): rho for rho in reversed(rhos)}
+    return sorted(sizes.values(), reverse=True)
+
+
 def _check_input(options: argparse.Namespace, names: Sequence[str]) -> None:
     """Raise if a level would replace the scene, whose name nobody gave as an output."""
+    from cvtgs.streams.files import replaced_names
+
     file = cvtgs.io.scene_file(options.input)
-    for name in names:
-        if is_same_file(options.output / name, file):
+    if options.stream is not None:
+        names = replaced_names(options.output, options.stream)
+    for level in (options.output / name for name in names):
+        if any(is_same_file(level, place) for place in (file, file.parent)):  # a SOG is a folder
             raise InvalidArgumentError(
-                f"{options.output / name}: a level must not replace the scene; choose another "
-                f"folder."
+                f"{level}: a level must not replace the scene; choose another folder."
             )
 
 

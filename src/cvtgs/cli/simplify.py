@@ -288,10 +288,11 @@ def _simplify_in_memory(
             cameras=cameras,
             keep=keep,
         )
-    if chosen is not None:
-        notes += chosen.late_note(report.seconds)
+    started = time.perf_counter()
     make_output_folder(options)
     cvtgs.io.save(small, options.output, overwrite=options.overwrite, axes=axes.target)
+    if chosen is not None:
+        notes += chosen.late_note(report.seconds + time.perf_counter() - started)
     remove_job_files(options.output)
     return report, notes
 
@@ -341,7 +342,7 @@ def _needs_blocks(options: argparse.Namespace, memory: int, config: "SimplifyCon
     from cvtgs.grouping import finer_count
     from cvtgs.outofcore.memory import IMAGE_BYTES, block_count
 
-    if config.uses_images:
+    if config.uses_images or has_target(options):
         memory -= IMAGE_BYTES
     rows = _rows_of(options.input)
     if rows is None:

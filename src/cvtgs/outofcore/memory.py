@@ -1,6 +1,7 @@
 """Free memory, the memory that a simplification needs, and the resulting number of blocks."""
 
 import math
+import os
 import re
 import sys
 from pathlib import Path
@@ -9,11 +10,11 @@ import torch
 
 from cvtgs.counts import checked_whole, whole_number
 from cvtgs.devices import core_count
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import InvalidArgumentError, warn
 from cvtgs.io.ply import PlyRows
 from cvtgs.outofcore.scan import SAMPLE_ROWS
 from cvtgs.processes import pool_size
-from cvtgs.text import size_text
+from cvtgs.text import counted, size_text
 
 LIBRARY_BYTES = 280_000_000 if torch.version.cuda is None else 430_000_000
 """Interpreter, torch and scipy. The CUDA build of torch takes 150 MB more of its own, and maps
@@ -31,6 +32,7 @@ CELL_BYTES = 1500
 components of view-dependent colour."""
 
 MERGING_BYTES = 230  # the same in one piece, beyond what rows take in other stages
+WRITING_ROWS = 5  # in rows of the file: what a format takes that is written from memory
 CELL_ROOM = 1 << 20  # number of cells that may merge together if no memory is given
 SHARED_BY = 4  # divides the number of blocks, so that two or four workers end at the same time
 
@@ -76,6 +78,19 @@ def check_memory(memory: int | None, *, with_images: bool) -> None:
         raise InvalidArgumentError(
             f"memory must be a whole number of bytes, at least {least:,} ({size_text(least)})"
             f"{' with images of the scene' * with_images}; found {memory!r}."
+        )
+
+
+def warn_of_writing(
+    output: str | os.PathLike[str], source: PlyRows, *, target: int, memory: int
+) -> None:
+    """Warn if an output that is written from memory takes more than there is."""
+    needed = LIBRARY_BYTES + WRITING_ROWS * source.dtype.itemsize * target
+    if needed > memory:
+        warn(
+            f"{os.fspath(output)}: this format is written all at once, which needs about "
+            f"{size_text(needed)} for {counted(target, 'Gaussian')}, more than the "
+            f"{size_text(memory)} of one process; a .ply is written part by part."
         )
 
 

@@ -42,6 +42,7 @@ from cvtgs.outofcore.memory import (
     chosen_blocks,
     memory_to_plan,
     sample_rows,
+    warn_of_writing,
 )
 from cvtgs.outofcore.merge import correct, inflate, merge, read_report, simplify_block
 from cvtgs.outofcore.resume import job_folder, started, with_earlier_sizes
@@ -152,6 +153,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     range_rows = checked_whole(range_rows, "range_rows")
     memory = None if memory is None else whole_number(memory)
     room = memory or memory_to_plan()
+    if not is_plain_ply(output):
+        warn_of_writing(output, rows, target=target, memory=room)
     if simplifier.config.uses_images:
         room -= IMAGE_BYTES
         if cameras is not None:

@@ -221,6 +221,11 @@ def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
         _remove(aside)
 
 
+def replaced_names(folder: Path, kind: str) -> list[str]:
+    """Return the files and folders of an earlier stream that a new one would replace."""
+    return [INDEX_NAMES[kind], *sorted(_names_of(folder / INDEX_NAMES[kind]))]
+
+
 def _names_of(index: Path) -> set[str]:
     """Return the files and folders in an index that cvtgs itself can have written."""
     try:

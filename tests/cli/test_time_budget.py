@@ -1,0 +1,76 @@
+"""Time budgets: the seconds of writing the output file count."""
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import cvtgs
+from cvtgs.budget import CostModel
+from cvtgs.cli.goals import ChosenPreset, _seconds_to_write, choose_preset
+from cvtgs.cli.main import build_parser, main
+from cvtgs.errors import GoalError
+from cvtgs.progress import silent
+
+MODEL = CostModel(rates={"plan": {"once": 0.0}, "refine": {"look_pixels": 2.5e-7}})
+
+
+@pytest.fixture
+def scene() -> cvtgs.GaussianScene:
+    return cvtgs.synthetic.scene("object", 300, sh_degree=0, seed=0)
+
+
+def options(name: str = "out.ply") -> argparse.Namespace:
+    words = ["simplify", "in.ply", name, "--rho", "0.1", "--time-budget", "8s", "--device", "cpu"]
+    known = build_parser().parse_args(words)
+    known.begun, known.output = time.perf_counter(), Path(name)
+    return known
+
+
+def test_a_time_budget_leaves_time_for_writing(
+    scene: cvtgs.GaussianScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 8 s, `high` takes 4; a file that takes 5 leaves too little for it."""
+    monkeypatch.setattr(cvtgs.budget, "cost_model", lambda *_, **__: MODEL)
+    monkeypatch.setattr("cvtgs.budget.calibrate.is_calibrated", lambda _: True)
+    chosen = {}
+    for seconds in (0.0, 5.0):
+        monkeypatch.setattr("cvtgs.cli.goals._seconds_to_write", lambda *_, s=seconds: s)
+        chosen[seconds] = choose_preset(options(), scene, {}, silent)
+        assert chosen[seconds].reason.endswith(f"and writing takes about {seconds:.1f} s.")
+    assert chosen[0.0].name == "high"
+    assert chosen[5.0].name != "high"
+    monkeypatch.setattr("cvtgs.cli.goals._seconds_to_write", lambda *_: 8.0)
+    with pytest.raises(GoalError, match=r"no preset fits into 8 s: .* writing takes about 8\.0 s"):
+        choose_preset(options(), scene, {}, silent)
+
+
+def test_a_run_whose_file_takes_too_long_says_so(
+    scene: cvtgs.GaussianScene,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def slowly(*given: Any, **named: Any) -> None:
+        monkeypatch.setattr(time, "perf_counter", lambda: clock() + 10.0)
+        save(*given, **named)
+
+    save, clock = cvtgs.io.save, time.perf_counter
+    save(scene, tmp_path / "in.ply")
+    chosen = ChosenPreset("draft", "a reason.", 10.0, "advice")
+    monkeypatch.setattr("cvtgs.cli.simplify.choose_preset", lambda *_, **__: chosen)
+    words = ["simplify", str(tmp_path / "in.ply"), str(tmp_path / "out.ply"), "--overwrite"]
+    words += ["--rho", "0.1", "--time-budget", "8s"]
+    assert main(words) == 0
+    assert "Simplifying and writing" not in capsys.readouterr().out
+    monkeypatch.setattr("cvtgs.io.save", slowly)
+    assert main(words) == 0
+    assert "Simplifying and writing took 10." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["out.ply", "out.sog"])
+def test_the_seconds_of_writing_grow_with_the_count(scene: cvtgs.GaussianScene, name: str) -> None:
+    few, many = (_seconds_to_write(options(name), scene, count) for count in (300, 30_000))
+    assert 0.0 < few < many
