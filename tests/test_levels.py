@@ -73,6 +73,22 @@ def test_errors_are_weighted_by_the_mass_as_seen_from_the_middle():
     assert level.geometric_error != pytest.approx(float(errors[1]), rel=1e-2)
 
 
+def test_error_sums_are_those_of_the_rows_that_each_small_gaussian_replaces(monkeypatch):
+    """Also of cells that two chunks of rows share."""
+    monkeypatch.setattr("cvtgs.pipeline.CHUNK", 37)
+    scene = random_scene(300)
+    (level,) = Simplifier(None, device="cpu").levels(scene, [0.1])
+    analysis, rows = analyze(scene, cvtgs.SimplifyConfig()), level.assignment.long()
+    kept = rows >= 0
+    squares = (scene.means - level.scene.means[rows.clamp_min(0)]).square().sum(dim=1)
+    masses = analysis.apparent_areas * analysis.opacities
+    sums = torch.stack([masses, masses * squares])[:, kept].double()
+    wanted = torch.zeros(2, 30, dtype=torch.float64).index_add_(1, rows[kept], sums)
+    torch.testing.assert_close(level.error_sums, wanted, rtol=1e-4, atol=1e-9)
+    total, distances = level.error_sums.sum(dim=1).tolist()
+    assert level.geometric_error == pytest.approx(math.sqrt(distances / total))
+
+
 @pytest.mark.slow
 def test_errors_are_those_of_the_refined_level():
     scene = random_scene(300)

@@ -4,7 +4,6 @@ Single runs, levels and protected regions call :func:`reduce_scene`. Out-of-core
 blocks call the functions of each stage in the same order, block by block (``outofcore/run.py``).
 """
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -26,9 +25,9 @@ from cvtgs.grouping import (
     tessellate_rows,
     weigh_rows,
 )
-from cvtgs.math.segments import segment_ids
+from cvtgs.math.segments import label_sums, segment_ids
 from cvtgs.mergenet import Net, correct_cells
-from cvtgs.report import CellStatistics, MatchReport
+from cvtgs.report import CellStatistics, MatchReport, rms_error
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities
 
@@ -302,39 +301,43 @@ def level_facts(
     reduced: Reduced,
     *,
     is_valid: Bool[Tensor, "n"] | None = None,
-) -> tuple[float, Int[Tensor, "n"] | None]:
-    """Compute error and assignment of a level, as in :class:`cvtgs.Level`, on the CPU.
+) -> tuple[float, Int[Tensor, "n"] | None, Float[Tensor, "2 m"] | None]:
+    """Compute error, assignment and error sums of a level, as in :class:`cvtgs.Level`, on the CPU.
 
     ``is_valid`` says which input rows the scene has; None if it has all of them.
     """
     partition = reduced.partition
     if partition is None and is_valid is None:
-        return 0.0, None
+        return 0.0, None, None
+    error, sums = 0.0, None
     if partition is None:
-        error, labels = 0.0, torch.arange(len(scene), dtype=torch.int32, device=scene.device)
+        labels = torch.arange(len(scene), dtype=torch.int32, device=scene.device)
     else:
         masses = analysis.apparent_areas * analysis.opacities
-        error = geometric_error(scene, reduced.scene, partition, masses=masses)
+        sums = error_sums(scene, reduced.scene, partition, masses=masses).cpu()
+        error = rms_error(sums)
         labels = partition.labels(len(scene))
     if is_valid is not None:
         of_valid, labels = labels, labels.new_full((len(is_valid),), -1)
         labels[is_valid] = of_valid
-    return error, labels.cpu()
+    return error, labels.cpu(), sums
 
 
-def geometric_error(
+def error_sums(
     scene: GaussianScene,
     small: GaussianScene,
     partition: cells.Partition,
     *,
     masses: Float[Tensor, "n"],
-) -> float:
-    """Return the mass-weighted RMS distance from Gaussians to their replacements, scene units."""
-    squares, total = 0.0, 0.0
+) -> Float[Tensor, "2 m"]:
+    """Sum the masses that each small Gaussian replaces, and mass times squared distance."""
+    sums = torch.zeros(2, len(small), dtype=torch.float64, device=scene.device)
     ids = segment_ids(partition.offsets, len(partition.order))
     chunk = chunk_length(CHUNK, scene.device)
     for rows, cell in zip(partition.order.split(chunk), ids.split(chunk), strict=True):
         shifts = scene.means[rows].double() - small.means[cell].double()
-        squares += float((masses[rows] * shifts.square().sum(dim=1)).sum())
-        total += float(masses[rows].sum())
-    return math.sqrt(squares / total) if total > 0.0 else 0.0
+        weights = masses[rows].double()
+        first, last = cell[[0, -1]].tolist()
+        columns = [weights, weights * shifts.square().sum(dim=1)]
+        sums[:, first : last + 1] += label_sums(columns, cell - first, last - first + 1)
+    return sums

@@ -212,8 +212,8 @@ class Prepared:
             matched = self._match(reduced, analysis, clock)
             result = self._result(matched, checked, analysis, target, clock)
             final = reduced._replace(scene=result.scene.to(valid.device))
-            facts = level_facts(valid, analysis, final, is_valid=checked.is_valid)
-            found[target] = Level(*result, *facts)
+            error, rows, sums = level_facts(valid, analysis, final, is_valid=checked.is_valid)
+            found[target] = Level(*result, error, rows, sums)
         return found
 
     def _analyze(self, target: int, clock: StageClock) -> tuple[CheckedScene, SceneAnalysis]:

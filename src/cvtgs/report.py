@@ -1,12 +1,13 @@
 """SimplifyReport and other reports: actions, dropped data and costs of a run."""
 
+import math
 from collections.abc import Iterable
 from functools import partial
 from pkgutil import resolve_name
 from typing import Literal, NamedTuple, Self
 
 import pydantic
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.analysis import EffectPlan
@@ -246,6 +247,12 @@ def check_one_scene(counts: Iterable[int]) -> None:
         )
 
 
+def rms_error(sums: Float[Tensor, "2 m"]) -> float:
+    """Return the root mean square distance of Gaussians, given the ``error_sums`` of a level."""
+    mass, squares = sums.numpy().sum(axis=1).tolist()  # by one thread, so always the same digits
+    return math.sqrt(squares / mass) if mass > 0.0 else 0.0
+
+
 class Level(NamedTuple):
     """One of several levels of a scene.
 
@@ -256,13 +263,18 @@ class Level(NamedTuple):
             them, weighted by apparent mass; scene units.
         assignment: ``(n,)`` row of the small Gaussian that represents each input row, int32, on the
             CPU; -1 for invalid and dropped rows. None if all rows are kept unchanged.
+        error_sums: ``(2, m)`` apparent mass that each small Gaussian replaces, and its sum of mass
+            times squared distance, float64, on the CPU: ``geometric_error`` is the root of the
+            quotient of their totals, and parts of a level have errors of their own. None if all
+            valid rows are kept.
     """
 
     scene: GaussianScene
     report: SimplifyReport
     geometric_error: float
     assignment: Int[Tensor, "n"] | None = None
+    error_sums: Float[Tensor, "2 m"] | None = None
 
     def __repr__(self) -> str:
-        """Return scene, report and error, not the assignment."""
+        """Return scene, report and error, not the tensors."""
         return f"Level({self.scene!r}, {self.report!r}, error {self.geometric_error:.3g})"

@@ -12,6 +12,7 @@ import torch
 
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
 from cvtgs.math.frames import robust_frame
+from cvtgs.report import rms_error
 from cvtgs.streams import (
     StreamPlan,
     blocks,
@@ -27,14 +28,18 @@ from cvtgs.streams.plan import environment_level, near_rows, plan_part
 from scenes import random_scene
 
 
-def level(places: list[float], owners: list[int] | None, error: float = 0.0) -> SimpleNamespace:
+def level(
+    places: list[float], owners: list[int] | None, sums: list[list[float]] | None = None
+) -> SimpleNamespace:
     """Return a level of Gaussians on a line."""
+    error_sums = None if sums is None else torch.tensor(sums, dtype=torch.float64)
     means = torch.zeros(len(places), 3)
     means[:, 0] = torch.tensor(places)
     return SimpleNamespace(
         scene=random_scene(len(places)).with_tensors({"means": means}, {}),
-        geometric_error=error,
+        geometric_error=0.0 if error_sums is None else rms_error(error_sums),
         assignment=None if owners is None else torch.tensor(owners, dtype=torch.int32),
+        error_sums=error_sums,
     )
 
 
@@ -126,18 +131,28 @@ def test_a_box_reaches_three_deviations_along_every_axis():
     assert chunk.box_max == pytest.approx((5.5, 6.0, 0.3), abs=1e-5)
 
 
-def test_tiles_state_the_largest_error_of_their_level_and_all_finer_ones(tmp_path: Path) -> None:
-    """The middle level is off by 5, the coarsest only by 3; viewers take a sixteenth."""
-    owners = list(range(4))
+def test_tiles_state_their_own_error_but_none_below_that_of_a_child(tmp_path: Path) -> None:
+    """Parts of the middle level are off by 1 and 5, the coarsest by 3; viewers take a sixteenth."""
+    places = [float(place) for place in range(8)]
     levels = (
-        level([0.0, 1, 2, 3], None),
-        level([0.0, 1, 2], [*owners[:3], 2], error=5.0),
-        level([0.0, 2], [0, 0, 1, 1], error=3.0),
+        level(places, None),
+        level(places[::2], [0, 0, 1, 1, 2, 2, 3, 3], [[1, 1, 1, 3], [2, 0, 100, 0]]),
+        level([1.0, 5.0], [0, 0, 0, 0, 1, 1, 1, 1], [[4, 4], [36, 36]]),
     )
-    write_tiles(planned(*levels, most=2), tmp_path, tile_gaussians=2)
+    write_tiles(planned(*levels, most=4), tmp_path, tile_gaussians=2)
     root = json.loads((tmp_path / "tileset.json").read_text())["root"]
     assert root["geometricError"] == 16 * 5.0
-    assert {child["geometricError"] for child in root["children"]} == {0.0}
+    assert [child["geometricError"] for child in root["children"]] == [16 * 1.0, 16 * 5.0]
+    leaves = [leaf for child in root["children"] for leaf in child["children"]]
+    assert [leaf["geometricError"] for leaf in leaves] == [0.0, 0.0]
+
+
+def test_parts_of_a_level_without_sums_have_its_error(tmp_path: Path) -> None:
+    fine, coarse = level([0.0, 1, 2, 3], None), level([0.0, 2], [0, 0, 1, 1])
+    coarse.geometric_error = 3.0
+    write_tiles(planned(fine, coarse, most=2), tmp_path, tile_gaussians=2)
+    root = json.loads((tmp_path / "tileset.json").read_text())["root"]
+    assert root["geometricError"] == 16 * 3.0
 
 
 CLAMPED = (

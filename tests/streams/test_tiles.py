@@ -11,9 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from cvtgs import GaussianScene, Simplifier, load, save
+from cvtgs import GaussianScene, Simplifier, concatenate, load, save
 from cvtgs.errors import DroppedDataWarning
 from cvtgs.streams import geo_transform, plan_stream, stream_file, write_tiles
+from cvtgs.streams.tiles import TilesFormat
 from cvtgs.synthetic import scene as make
 
 SURVEY = torch.tensor([2_683_000.125, -410.5, 1_247_000.75], dtype=torch.float64)
@@ -102,6 +103,37 @@ def test_one_far_gaussian_does_not_cost_the_others_digits(tmp_path: Path) -> Non
     ((_, points),) = placed(tmp_path)
     near = in_tile_axes(levels[0].scene)[1:]
     assert float(torch.cdist(near, points).amin(dim=1).max()) < 3e-4
+
+
+@pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
+@pytest.mark.parametrize("blocks", [None, 2])
+def test_tiles_of_an_object_have_smaller_errors_than_those_of_a_sky(
+    blocks: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All tiles of a level had the same one, also within a block."""
+    near = make("object", 3000, sh_degree=0, seed=2)
+    far = make("object", 1000, sh_degree=0, seed=3)
+    scene = concatenate([near, far.with_tensors({"means": 100 * far.means})])
+    if blocks is None:
+        plan = plan_stream(FAST.levels(scene, [1.0, 0.25, 0.01]), chunk_gaussians=300)
+        write_tiles(plan, tmp_path / "out", tile_gaussians=150)
+    else:
+        monkeypatch.setattr(
+            "cvtgs.streams.blocks._format", lambda kind, **_: TilesFormat(tile_gaussians=150)
+        )
+        save(scene, tmp_path / "scene.ply")
+        options: dict[str, Any] = {"kind": "3dtiles", "blocks": blocks, "chunk_gaussians": 300}
+        ratios = [1.0, 0.25, 0.01]
+        stream_file(tmp_path / "scene.ply", tmp_path / "out", ratios, simplifier=FAST, **options)
+    errors = [
+        tile["geometricError"]
+        for tile, _ in placed(tmp_path / "out")
+        if tile["content"]["uri"].startswith("0_")
+        and tile.get("children")
+        and not any("children" in child for child in tile["children"])
+    ]
+    assert len(errors) > 4
+    assert max(errors) > 10 * min(errors)
 
 
 def test_the_scene_points_right_to_the_east_and_forward_to_the_north(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.analysis.effects import restore_comments, select_columns
@@ -77,7 +77,8 @@ class BlockLevel(NamedTuple):
 
     scene: GaussianScene
     geometric_error: float
-    assignment: Int[Tensor, "n"] | None
+    assignment: Int[Tensor, "n"] | None = None
+    error_sums: Float[Tensor, "2 m"] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -351,7 +352,7 @@ def write_block(spec: StreamJob, block: int) -> None:
     for target in targets:
         if target >= len(scene):
             whole = restore_comments(with_finite_opacities(scene), scene, analysis.plan)
-            levels.append(BlockLevel(whole, 0.0, None))
+            levels.append(BlockLevel(whole, 0.0))
             continue
         reduced = reduce_scene(scene, analysis, target, job.config, net=net, clock=clock)
         levels.append(BlockLevel(reduced.scene, *level_facts(scene, analysis, reduced)))

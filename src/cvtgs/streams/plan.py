@@ -57,6 +57,11 @@ class StreamedLevel(Protocol):
         """Row of the Gaussian that replaces each input row, -1 for none; None if all are kept."""
         ...
 
+    @property
+    def error_sums(self) -> Float[Tensor, "2 m"] | None:
+        """Sums from which parts have their errors; None if all have that of the level."""
+        ...
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StreamChunk:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.boxes import Corner
@@ -25,6 +25,7 @@ from cvtgs.io.gltf import write_spz_glb
 from cvtgs.io.gltf.document import AXES, SPLATS, SPZ
 from cvtgs.io.limits import FORMAT_LIMITS, dropped_within
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
+from cvtgs.report import rms_error
 from cvtgs.streams.files import StreamLevel, StreamPart, join_trees, write_stream
 from cvtgs.streams.plan import StreamNode, StreamPlan, join_boxes
 from cvtgs.text import shown
@@ -74,7 +75,7 @@ class TilesFormat:
         dropped = Counter[str]()
         for number, tile in enumerate(tiles):
             scene = plan.levels[tile.level].scene
-            rows = torch.cat([plan.chunks[chunk].rows[tile.level] for chunk in tile.chunks])
+            rows = _rows(plan, tile)
             some = tagged_if_flat(scene.select(rows.to(scene.device)))
             means = some.means.detach().double()
             origins[id(tile)] = _median(means)
@@ -293,16 +294,28 @@ def _entry(
     plan: StreamPlan, tile: _Tile, names: dict[int, str], origins: dict[int, Corner]
 ) -> dict[str, Any]:
     """Return a tile, with the origin of each tile in the axes of 3D Tiles as its transform."""
-    # finer tiles never have larger errors
-    error = max(level.geometric_error for level in plan.levels[: tile.level + 1])
     entry: dict[str, Any] = {
         **_located(tile.node.box_min, tile.node.box_max, origins[id(tile)]),
-        "geometricError": ERROR_PIXELS * error if tile.children else 0.0,
+        "geometricError": 0.0,
         "content": {"uri": names[id(tile)]},
     }
     if tile.children:
-        entry["children"] = [_entry(plan, child, names, origins) for child in tile.children]
+        below = [_entry(plan, child, names, origins) for child in tile.children]
+        errors = [child["geometricError"] for child in below]  # never larger than that of a parent
+        entry["geometricError"] = max(ERROR_PIXELS * _error(plan, tile), *errors)
+        entry["children"] = below
     return entry
+
+
+def _error(plan: StreamPlan, tile: _Tile) -> float:
+    """Return the error of the Gaussians of a tile, which may be far from that of their level."""
+    level = plan.levels[tile.level]
+    sums = level.error_sums
+    return level.geometric_error if sums is None else rms_error(sums[:, _rows(plan, tile)])
+
+
+def _rows(plan: StreamPlan, tile: _Tile) -> Int[Tensor, "k"]:
+    return torch.cat([plan.chunks[chunk].rows[tile.level] for chunk in tile.chunks])
 
 
 def _parent(low: Corner, high: Corner, children: list[dict[str, Any]]) -> dict[str, Any]:
