@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 import torch
 
+from cvtgs import load
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
 from cvtgs.math.frames import robust_frame
+from cvtgs.math.parameters import rotation_matrices
 from cvtgs.report import rms_error
 from cvtgs.streams import (
     StreamPlan,
@@ -119,7 +121,7 @@ def test_levels_that_require_gradients_are_planned():
 
 
 def test_a_box_reaches_three_deviations_along_every_axis():
-    """A needle along its own x, turned by 90 degrees about z, is one along y."""
+    """And 6 % more. A needle along its own x, turned by 90 degrees about z, is one along y."""
     one = level([4.0], None)
     tensors = {
         "quats": torch.tensor([[0.5**0.5, 0, 0, 0.5**0.5]]),
@@ -127,8 +129,21 @@ def test_a_box_reaches_three_deviations_along_every_axis():
     }
     one.scene = one.scene.with_tensors(tensors, {})
     (chunk,) = planned(one, most=1).chunks
-    assert chunk.box_min == pytest.approx((2.5, -6.0, -0.3), abs=1e-5)
-    assert chunk.box_max == pytest.approx((5.5, 6.0, 0.3), abs=1e-5)
+    assert chunk.box_min == pytest.approx((2.41, -6.36, -0.318), abs=1e-5)
+    assert chunk.box_max == pytest.approx((5.59, 6.36, 0.318), abs=1e-5)
+
+
+def test_boxes_hold_three_deviations_of_the_rounded_gaussians_of_a_sog(tmp_path: Path) -> None:
+    """Scales have 256 different values in a file, and the largest are farthest apart."""
+    one = level([0.0] * 2000, None)
+    log_scales = torch.randn(2000, 3, generator=torch.Generator().manual_seed(1))
+    one.scene = one.scene.with_tensors({"log_scales": log_scales})
+    plan = planned(one, most=2000)
+    write_sog_stream(plan, tmp_path)
+    written = load(tmp_path)
+    axes = rotation_matrices(written.quats) * written.scales[:, None, :]
+    reach = (written.means + 3 * axes.square().sum(dim=2).sqrt()).amax(dim=0)
+    assert (reach <= torch.tensor(plan.root.box_max)).all()
 
 
 def test_tiles_state_their_own_error_but_none_below_that_of_a_child(tmp_path: Path) -> None:

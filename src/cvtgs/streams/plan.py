@@ -31,7 +31,9 @@ CHUNK_GAUSSIANS = 1 << 15
 ENVIRONMENT_GAUSSIANS = 1 << 16
 """Maximum size of the environment, unless the coarsest level has more that far away."""
 
-_SIGMAS = 3.0  # extent of Gaussians in the boxes of chunks, in standard deviations
+_SIGMAS = 3.0  # extent of Gaussians in boxes, in standard deviations
+
+_ROUNDING = 1.06  # factor on this extent, for scales and rotations that files round
 
 _SPREAD = (0.05, 0.95)
 """Quantiles whose distance selects the axis of a split; they exclude outlying Gaussians."""
@@ -69,7 +71,8 @@ class StreamChunk:
 
     Attributes:
         rows: Row numbers in every level, the finest first, along a Morton curve.
-        box_min: Minimum coordinates of the Gaussians of all levels, at three sigmas.
+        box_min: Minimum coordinates of the Gaussians of all levels, at three sigmas and 6 % more,
+            since files round scales and rotations.
         box_max: Maximum coordinates.
     """
 
@@ -298,17 +301,19 @@ def _rows(labels: Int[Tensor, "m"], scene: GaussianScene, count: int) -> list[In
 
 def _chunk(levels: Sequence[StreamedLevel], rows: tuple[Int[Tensor, "k"], ...]) -> StreamChunk:
     """Build a chunk with the box of its Gaussians at all levels."""
-    lows, highs = [], []
-    for level, own in zip(levels, rows, strict=True):
-        if len(own) == 0:
-            continue
-        part = level.scene.select(own.to(level.scene.device))
-        axes = rotation_matrices(part.quats.double()) * part.scales.double()[:, None, :]
-        reach = _SIGMAS * axes.square().sum(dim=2).sqrt()
-        lows.append((part.means.double() - reach).amin(dim=0))
-        highs.append((part.means.double() + reach).amax(dim=0))
-    low, high = torch.stack(lows).amin(dim=0), torch.stack(highs).amax(dim=0)
-    return StreamChunk(rows=rows, box_min=_three(low.tolist()), box_max=_three(high.tolist()))
+    pairs = [(level.scene, own) for level, own in zip(levels, rows, strict=True) if len(own)]
+    low, high = join_boxes(box_of(scene.select(own.to(scene.device))) for scene, own in pairs)
+    return StreamChunk(rows=rows, box_min=low, box_max=high)
+
+
+def box_of(scene: GaussianScene, origin: Corner = (0.0, 0.0, 0.0)) -> tuple[Corner, Corner]:
+    """Return the corners of the box of Gaussians about an origin, also after files round them."""
+    axes = rotation_matrices(scene.quats.double()) * scene.scales.double()[:, None, :]
+    reach = _SIGMAS * _ROUNDING * axes.square().sum(dim=2).sqrt()
+    means = scene.means.double()
+    means = means + means.new_tensor(origin)
+    low, high = (means - reach).amin(dim=0), (means + reach).amax(dim=0)
+    return _three(low.tolist()), _three(high.tolist())
 
 
 def _node(cut: _Cut, chunks: Sequence[StreamChunk]) -> StreamNode:
