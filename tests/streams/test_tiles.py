@@ -21,18 +21,22 @@ SURVEY = torch.tensor([2_683_000.125, -410.5, 1_247_000.75], dtype=torch.float64
 FAST = Simplifier(None, preset="draft", device="cpu")
 
 
-def placed(folder: Path) -> Iterator[tuple[dict[str, Any], Tensor]]:
-    """Yield every tile with content, and its positions where a viewer draws them.
+def inside_of(folder: Path, tile: dict[str, Any]) -> Tensor:
+    """Return the positions of a tile, relative to its origin, in the axes of 3D Tiles.
 
     Viewers turn glTF from y up to z up: (x, y, z) to (x, -z, y).
     """
+    x, y, z = load(folder / tile["content"]["uri"], axes="rdf").means.double().unbind(1)
+    return torch.stack([x, -z, y], dim=1)
+
+
+def placed(folder: Path) -> Iterator[tuple[dict[str, Any], Tensor]]:
+    """Yield every tile with content, and its positions where a viewer draws them."""
 
     def below(tile: dict[str, Any], above: Tensor) -> Iterator[tuple[dict[str, Any], Tensor]]:
         matrix = above @ torch.tensor(tile["transform"], dtype=torch.float64).reshape(4, 4).T
         if "content" in tile:
-            means = load(folder / tile["content"]["uri"], axes="rdf").means.double()
-            points = torch.stack([means[:, 0], -means[:, 2], means[:, 1]], dim=1)
-            yield tile, points @ matrix[:3, :3].T + matrix[:3, 3]
+            yield tile, inside_of(folder, tile) @ matrix[:3, :3].T + matrix[:3, 3]
         for child in tile.get("children", ()):
             yield from below(child, matrix)
 
@@ -105,6 +109,47 @@ def test_one_far_gaussian_does_not_cost_the_others_digits(tmp_path: Path) -> Non
     assert float(torch.cdist(near, points).amin(dim=1).max()) < 3e-4
 
 
+def write(
+    scene: GaussianScene,
+    folder: Path,
+    rhos: list[float],
+    *,
+    blocks: int | None,
+    chunk_gaussians: int,
+) -> None:
+    """Write 3D Tiles to ``folder / "out"``, in one piece without a number of blocks."""
+    if blocks is None:
+        plan = plan_stream(FAST.levels(scene, rhos), chunk_gaussians=chunk_gaussians)
+        write_tiles(plan, folder / "out")
+        return
+    save(scene, folder / "scene.ply")
+    options: dict[str, Any] = {"blocks": blocks, "chunk_gaussians": chunk_gaussians}
+    out = folder / "out"
+    stream_file(folder / "scene.ply", out, rhos, kind="3dtiles", simplifier=FAST, **options)
+
+
+@pytest.mark.parametrize("blocks", [None, 2])
+def test_boxes_enclose_flyaways_where_files_hold_them(blocks: int | None, tmp_path: Path) -> None:
+    """Not where they were; so the error of the whole tileset stays small, too."""
+    scene = make("object", 6000, sh_degree=0, seed=2)
+    means, log_scales = scene.means.clone(), scene.log_scales.clone()
+    means[0] = torch.tensor([1e6, 0.0, 0.0])
+    log_scales[1] = 20.0
+    flying = scene.with_tensors({"means": means, "log_scales": log_scales})
+    with pytest.warns(DroppedDataWarning, match="clamped"):
+        write(flying, tmp_path, [1.0, 0.05], blocks=blocks, chunk_gaussians=10_000)
+    farthest = 0.0
+    for tile, _ in placed(tmp_path / "out"):
+        points, box = inside_of(tmp_path / "out", tile), tile["boundingVolume"]["box"]
+        half = torch.tensor([box[3], box[7], box[11]], dtype=torch.float64)
+        assert ((points - torch.tensor(box[:3], dtype=torch.float64)).abs() <= half).all()
+        assert float(half.max()) < 5000
+        farthest = max(farthest, float(points.abs().max()))
+    assert farthest > 500
+    document = json.loads((tmp_path / "out" / "tileset.json").read_text())
+    assert document["geometricError"] < 20_000
+
+
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
 @pytest.mark.parametrize("blocks", [None, 2])
 def test_tiles_of_an_object_have_smaller_errors_than_those_of_a_sky(
@@ -114,17 +159,10 @@ def test_tiles_of_an_object_have_smaller_errors_than_those_of_a_sky(
     near = make("object", 3000, sh_degree=0, seed=2)
     far = make("object", 1000, sh_degree=0, seed=3)
     scene = concatenate([near, far.with_tensors({"means": 100 * far.means})])
-    if blocks is None:
-        plan = plan_stream(FAST.levels(scene, [1.0, 0.25, 0.01]), chunk_gaussians=300)
-        write_tiles(plan, tmp_path / "out", tile_gaussians=150)
-    else:
-        monkeypatch.setattr(
-            "cvtgs.streams.blocks._format", lambda kind, **_: TilesFormat(tile_gaussians=150)
-        )
-        save(scene, tmp_path / "scene.ply")
-        options: dict[str, Any] = {"kind": "3dtiles", "blocks": blocks, "chunk_gaussians": 300}
-        ratios = [1.0, 0.25, 0.01]
-        stream_file(tmp_path / "scene.ply", tmp_path / "out", ratios, simplifier=FAST, **options)
+    few = TilesFormat(tile_gaussians=150)
+    monkeypatch.setattr("cvtgs.streams.tiles.TilesFormat", lambda **_: few)
+    monkeypatch.setattr("cvtgs.streams.blocks.TilesFormat", lambda **_: few)
+    write(scene, tmp_path, [1.0, 0.25, 0.01], blocks=blocks, chunk_gaussians=300)
     errors = [
         tile["geometricError"]
         for tile, _ in placed(tmp_path / "out")

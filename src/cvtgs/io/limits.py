@@ -190,14 +190,11 @@ def dropped_within(scene: GaussianScene, limits: FormatLimits) -> dict[str, int]
         count = int((~rows).sum())
         verbs = "is not finite or has" if count == 1 else "are not finite or have"
         dropped[f"{counted(count, 'Gaussian')} that {verbs} no rotation"] = 0
-    ranges, step = dict(limits.ranges), 0.0
+    ranges, step = _ranges(scene, limits), 0.0
     if scene.dtype == torch.float64:
         step = lost_step(scene, in_file=True)
     if limits.fixed_point:
-        from cvtgs.io.spz.write import largest_coordinate  # noqa: PLC0415 (only where written)
-
-        largest = largest_coordinate(scene)
-        ranges["means"] = (-largest, largest)
+        largest = ranges["means"][1]
         if largest / SPZ_STEPS > _USUAL_SPZ_STEP:
             step = max(step, coarse_step(scene, largest / SPZ_STEPS))
     if step > 0:
@@ -211,3 +208,21 @@ def dropped_within(scene: GaussianScene, limits: FormatLimits) -> dict[str, int]
         if count:
             dropped[f"{_VALUES[name]} outside [{low:.5g}, {high:.5g}], which are clamped"] = count
     return dropped
+
+
+def clamped_within(scene: GaussianScene, limits: FormatLimits) -> GaussianScene:
+    """Return the rows that a file holds, with their values clamped to its ranges."""
+    rows = scene.select(writable_rows(scene))
+    ranges = _ranges(scene, limits).items()
+    return rows.with_tensors({name: getattr(rows, name).clamp(*ends) for name, ends in ranges})
+
+
+def _ranges(scene: GaussianScene, limits: FormatLimits) -> dict[str, tuple[float, float]]:
+    """Return the minimum and maximum of each limited tensor in a file of the scene."""
+    ranges = dict(limits.ranges)
+    if limits.fixed_point:
+        from cvtgs.io.spz.write import largest_coordinate  # noqa: PLC0415 (only where written)
+
+        largest = largest_coordinate(scene)
+        ranges["means"] = (-largest, largest)
+    return ranges

@@ -23,11 +23,11 @@ from cvtgs.io.axes import SCENE_AXES, change_axes
 from cvtgs.io.formats import tagged_if_flat
 from cvtgs.io.gltf import write_spz_glb
 from cvtgs.io.gltf.document import AXES, SPLATS, SPZ
-from cvtgs.io.limits import FORMAT_LIMITS, dropped_within
+from cvtgs.io.limits import FORMAT_LIMITS, clamped_within, dropped_within
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import rms_error
 from cvtgs.streams.files import StreamLevel, StreamPart, join_trees, write_stream
-from cvtgs.streams.plan import StreamNode, StreamPlan, join_boxes
+from cvtgs.streams.plan import StreamNode, StreamPlan, box_of, join_boxes
 from cvtgs.text import shown
 
 __all__ = ["check_transform", "geo_transform", "write_tiles"]
@@ -49,7 +49,6 @@ multiplied by it, so that viewers refine where Gaussians are off by one pixel.""
 class _Tile:
     """A tile: consecutive chunks at one level, and the finer tiles that replace it."""
 
-    node: StreamNode
     level: int
     chunks: range
     children: list["_Tile"] = field(default_factory=list)
@@ -66,12 +65,17 @@ class TilesFormat:
     def write_part(
         self, plan: StreamPlan, folder: Path, *, part: int, listener: ProgressListener
     ) -> StreamPart:
-        """Write the tiles of a part; the first holds the coarsest level of the whole part."""
+        """Write the tiles of a part; the first holds the coarsest level of the whole part.
+
+        Boxes enclose what files hold, which may be less than the plan has: they clamp flyaways.
+        """
+        limits = FORMAT_LIMITS[".spz.glb"]
         root = _tiles(plan, self.tile_gaussians)
         tiles = list(_listed(root))
         names = {id(tile): f"{part}_{number}.glb" for number, tile in enumerate(tiles)}
         counts, files, sizes = ([0] * len(plan.levels) for _ in range(3))
         origins: dict[int, Corner] = {}
+        boxes: dict[int, tuple[Corner, Corner]] = {}
         dropped = Counter[str]()
         for number, tile in enumerate(tiles):
             scene = plan.levels[tile.level].scene
@@ -85,18 +89,25 @@ class TilesFormat:
             path = folder / names[id(tile)]
             with np.errstate(over="ignore"), atomic_output(path, overwrite=True) as file:
                 write_spz_glb(turned, file)
-            dropped.update(dropped_within(turned, FORMAT_LIMITS[".spz.glb"]))
+            dropped.update(dropped_within(turned, limits))
+            held = clamped_within(local.with_sh_degree(0), limits)  # boxes need no more
+            boxes[id(tile)] = box_of(held, origins[id(tile)])
             counts[tile.level] += len(rows)
             files[tile.level] += 1
             sizes[tile.level] += path.stat().st_size
             listener(ProgressEvent(stage="write", done=number + 1, total=len(tiles)))
+        for tile in reversed(tiles):  # children first
+            inner = [boxes[id(child)] for child in tile.children]
+            boxes[id(tile)] = join_boxes([boxes[id(tile)], *inner])
+        box_min, box_max = boxes[id(root)]
+        located = {tile: _located(*box, origins[tile]) for tile, box in boxes.items()}
         return StreamPart(
             levels=tuple(map(StreamLevel, counts, files, sizes)),
             chunks=len(plan.chunks),
             names=tuple(names.values()),
-            tree=_entry(plan, root, names, origins),
-            box_min=plan.root.box_min,
-            box_max=plan.root.box_max,
+            tree=_entry(plan, root, names, located),
+            box_min=box_min,
+            box_max=box_max,
             dropped=dropped,
         )
 
@@ -274,7 +285,7 @@ def _tiles(plan: StreamPlan, most: int) -> _Tile:
 
     def tile(node: StreamNode, chunks: range, level: int) -> _Tile:
         finer = list(below(node, chunks, level))
-        return _Tile(node=node, level=level, chunks=chunks, children=finer)
+        return _Tile(level=level, chunks=chunks, children=finer)
 
     whole = range(len(plan.chunks))
     return tile(plan.root, whole, len(plan.levels) - 1)
@@ -291,16 +302,16 @@ def _listed(tile: _Tile) -> Iterator[_Tile]:
 
 
 def _entry(
-    plan: StreamPlan, tile: _Tile, names: dict[int, str], origins: dict[int, Corner]
+    plan: StreamPlan, tile: _Tile, names: dict[int, str], located: dict[int, dict[str, Any]]
 ) -> dict[str, Any]:
-    """Return a tile, with the origin of each tile in the axes of 3D Tiles as its transform."""
+    """Return a tile, with its box and transform of :func:`_located`."""
     entry: dict[str, Any] = {
-        **_located(tile.node.box_min, tile.node.box_max, origins[id(tile)]),
+        **located[id(tile)],
         "geometricError": 0.0,
         "content": {"uri": names[id(tile)]},
     }
     if tile.children:
-        below = [_entry(plan, child, names, origins) for child in tile.children]
+        below = [_entry(plan, child, names, located) for child in tile.children]
         errors = [child["geometricError"] for child in below]  # never larger than that of a parent
         entry["geometricError"] = max(ERROR_PIXELS * _error(plan, tile), *errors)
         entry["children"] = below
