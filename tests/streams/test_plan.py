@@ -238,7 +238,7 @@ def test_every_block_with_rows_has_a_gaussian_at_every_level(tmp_path: Path) -> 
         write_file=lambda name, content: (tmp_path / name).write_bytes(content),
     )
     share = vars(blocks)["_write_targets"]
-    share(SimpleNamespace(job=job), [14, 6, 2], [12, 0, 1, 1], [12.0, 0.0, 1.0, 1.0])
+    share(SimpleNamespace(job=job), [14, 6, 2], [12, 0, 1, 1], [[12.0, 0.0, 1.0, 1.0]] * 3)
     found = json.loads((tmp_path / "targets.json").read_text())["targets"]
     assert found == [[12, 4, 1], [0, 0, 0], [1, 1, 1], [1, 1, 1]]
 

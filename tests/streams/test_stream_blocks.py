@@ -68,6 +68,25 @@ def test_counts_are_exact_and_the_finest_level_is_the_scene(
     assert names_in(tmp_path) == ["out", "scene.ply"]
 
 
+def test_blocks_get_the_counts_of_one_piece(tmp_path: Path) -> None:
+    """Half of the scene has one colour, so its Gaussians merge at less cost."""
+    plain = make("object", 1500, sh_degree=0, seed=1)
+    plain = plain.with_tensors({"sh0": torch.zeros_like(plain.sh0)}, {})
+    generator = torch.Generator().manual_seed(0)
+    colors = torch.randn(plain.sh0.shape, generator=generator)
+    away = plain.means + torch.tensor([10 * float(plain.means.abs().max()), 0.0, 0.0])
+    pair = concatenate([plain, plain.with_tensors({"means": away, "sh0": colors}, {})])
+    save(pair, tmp_path / "scene.ply")
+    stream(tmp_path / "scene.ply", tmp_path / "out", blocks=2)
+    middle = float(away[:, 0].mean()) / 2
+    for lod, level in enumerate(FAST.levels(pair, RHOS)[:2]):
+        found = load(tmp_path / "out", lod=lod)
+        count, wanted = (int((s.means[:, 0] > middle).sum()) for s in (found, level.scene))
+        assert len(found) == len(level.scene)
+        assert abs(count - wanted) <= 0.05 * len(found)
+        assert lod == 0 or count > 0.55 * len(found)
+
+
 @pytest.mark.slow
 def test_every_level_has_the_mass_of_a_run_in_one_piece(tmp_path: Path) -> None:
     room = make("room", 4000, sh_degree=0, seed=3)

@@ -48,6 +48,7 @@ from cvtgs.streams.files import (
     write_index,
 )
 from cvtgs.streams.plan import CHUNK_GAUSSIANS, check_environment, near_rows, plan_part
+from cvtgs.streams.shares import block_shares
 from cvtgs.streams.sog import SogFormat
 from cvtgs.streams.tiles import TilesFormat, check_no_environment, check_transform
 from cvtgs.text import counted, shown
@@ -157,8 +158,9 @@ def stream_file(  # noqa: PLR0913 (options by name)
 
     The file is sorted into blocks of space, which are stored in a hidden folder beside the output.
     Each block is simplified to its exact share of every level, based on the analysis of the whole
-    scene, and written as a part of the stream. After an interruption, the same call continues with
-    the unfinished blocks. The result depends on the number of blocks, not on the workers.
+    scene, and written as a part of the stream. Shares follow the cells of a sample of the whole
+    scene. After an interruption, the same call continues with the unfinished blocks. The result
+    depends on the number of blocks, not on the workers.
 
     Args:
         source: A binary PLY file.
@@ -308,7 +310,10 @@ def _run(
         if not resumes:
             with one_thread():
                 found = sort_into_blocks(job, workers, clock, keep_all=True)
-            _write_targets(spec, targets, found.rows, found.cells)
+                with clock.stage("allocate"):
+                    ratios = [target / sum(found.rows) for target in targets]
+                    shares = block_shares(job, ratios, found.cells, sh_degree=spec.sh_degree)
+            _write_targets(spec, targets, found.rows, shares)
     make_folder(spec.folder)
     blocks = [block for block, counts in enumerate(spec.targets()) if counts[0]]
     unfinished = [block for block in blocks if spec.finished(block) is None]
@@ -320,17 +325,17 @@ def _run(
 
 
 def _write_targets(
-    spec: StreamJob, targets: Sequence[int], rows: Sequence[int], cells: Sequence[float]
+    spec: StreamJob, targets: Sequence[int], rows: Sequence[int], shares: Sequence[Sequence[float]]
 ) -> None:
-    """Divide every level among the blocks by weight; blocks with rows get at least one Gaussian."""
+    """Divide every level among the blocks; blocks with rows get at least one Gaussian."""
     total = sum(rows)
     if total < spec.job.source.count:
         scan = spec.job.read_scan()
         warn_of_dropped(spec.job.source.count - total, spec.job.source.count, scan.invalid_rows)
     rooms, levels = list(rows), []
-    for target in targets:
+    for target, parts in zip(targets, shares, strict=True):
         least = sum(1 for room in rooms if room)
-        rooms = shared_out(max(least, min(target, sum(rooms))), cells, rooms=rooms)
+        rooms = shared_out(max(least, min(target, sum(rooms))), parts, rooms=rooms)
         levels.append(rooms)
     content = json.dumps({"targets": list(zip(*levels, strict=True))})
     spec.job.write_file("targets.json", content.encode())
