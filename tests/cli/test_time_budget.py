@@ -1,6 +1,7 @@
 """Time budgets: the seconds of writing the output file count."""
 
 import argparse
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -74,3 +75,8 @@ def test_a_run_whose_file_takes_too_long_says_so(
 def test_the_seconds_of_writing_grow_with_the_count(scene: cvtgs.GaussianScene, name: str) -> None:
     few, many = (_seconds_to_write(options(name), scene, count) for count in (300, 30_000))
     assert 0.0 < few < many
+    none = scene.with_tensors({"means": scene.means * math.nan})
+    assert _seconds_to_write(options(name), none, 300) == 0.0
+    first = scene.means.clone()
+    first[0] = math.nan
+    assert _seconds_to_write(options(name), scene.with_tensors({"means": first}), 300) > 0.0

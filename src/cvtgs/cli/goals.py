@@ -135,9 +135,13 @@ def choose_preset(
 
 def _seconds_to_write(options: argparse.Namespace, scene: "GaussianScene", count: int) -> float:
     """Estimate the seconds that a scene of some Gaussians takes to write in the format of OUT."""
+    some = scene[: min(count, SAMPLED)]
+    some = some[cvtgs.validity.writable_rows(some)]
+    if len(some) == 0:
+        return 0.0
     with TemporaryDirectory() as folder, without_warnings(DroppedDataWarning):
         seconds = []
-        for sample in (scene[:1], scene[: min(count, SAMPLED)]):  # the first loads libraries
+        for sample in (some[:1], some):  # the first loads libraries
             started = time.perf_counter()
             cvtgs.io.save(sample, Path(folder) / options.output.name, overwrite=True)
             seconds.append(time.perf_counter() - started)
