@@ -3,7 +3,8 @@
 ``python -m benchmarks.large levels`` compares the time of levels with that of separate runs;
 ``seams`` compares runs by blocks with runs in one piece, by the cameras beside a file where it has
 some (``benchmarks.cameras``); ``--fit 48`` gives presets with images that many others, and
-``--exact`` takes the ratio alone instead of five around it. ``blocks`` simplifies large files, or a
+``--exact`` takes the ratio alone instead of five around it, and ``--stream`` compares the finest
+level of streams, written as SOG in both cases. ``blocks`` simplifies large files, or a
 generated one of ``--count`` Gaussians, each in its own process, and prints user CPU seconds and
 peak memory. With ``--workers 1 2`` it also prints the speedup of two workers on two cores over one
 on one, and whether both write the same bytes. ``make`` writes a generated file. Tables are
@@ -30,6 +31,7 @@ from benchmarks.quality import score_views
 from cvtgs.cameras import Cameras
 from cvtgs.outofcore import simplify_file
 from cvtgs.outofcore.memory import read_bytes
+from cvtgs.streams import plan_stream, stream_file, write_sog_stream
 from cvtgs.views import automatic_views
 
 RATIOS, RUNS = (0.1, 0.01, 0.001), 3
@@ -47,6 +49,7 @@ def main() -> None:
     parser.add_argument("--presets", default="standard", help="presets to compare by blocks")
     parser.add_argument("--fit", type=int, default=0, help="number of cameras to give to presets")
     parser.add_argument("--exact", action="store_true", help="compare at the ratio alone")
+    parser.add_argument("--stream", action="store_true", help="compare streams by blocks")
     parser.add_argument(
         "--memory",
         default="2GB",
@@ -115,6 +118,10 @@ def seams(options: argparse.Namespace) -> None:
             cvtgs.save(scene, path)
             for number, share in itertools.product(numbers, shares):
                 rho = min(1.0, share * options.rho)
+                if options.stream:
+                    stream(path, scene, rho, Path(folder) / "out", blocks=number, by=simplifier)
+                    found[number].append(cvtgs.load(Path(folder) / "out"))
+                    continue
                 if number == 1:
                     found[number].append(simplifier.simplify(scene, rho, cameras=given))
                     continue
@@ -128,6 +135,23 @@ def seams(options: argparse.Namespace) -> None:
         for one, other in zip(psnr[1:], ssim[1:], strict=True):
             words.append(f"{difference(one, psnr[0]):+.2f} ({other - ssim[0]:+.4f}) |")
         print(f"| {name}, {len(scene):,} | {preset} |", *words, flush=True)
+
+
+def stream(
+    path: Path,
+    scene: cvtgs.GaussianScene,
+    rho: float,
+    folder: Path,
+    *,
+    blocks: int,
+    by: cvtgs.Simplifier,
+) -> None:
+    """Write a stream whose finest level has a ratio and whose other one a quarter of it."""
+    rhos = [rho, rho / 4]
+    if blocks == 1:
+        write_sog_stream(plan_stream(by.levels(scene, rhos)), folder, overwrite=True)
+    else:
+        stream_file(path, folder, rhos, kind="sog", blocks=blocks, simplifier=by, overwrite=True)
 
 
 def blocks(options: argparse.Namespace) -> None:

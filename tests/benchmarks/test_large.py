@@ -113,3 +113,14 @@ def test_seams_where_nearly_all_is_kept(monkeypatch, capsys):
     large.main()
     assert rhos == [0.97, 0.985, 1.0, 1.0, 1.0]
     assert capsys.readouterr().out.splitlines()[-1].endswith("| inf (1.0000) | +0.00 (+0.0000) |")
+
+
+def test_streams_in_blocks_are_compared_with_one_piece(monkeypatch, capsys):
+    words = ["large", "seams", "--stream", "--exact", "--kinds", "object", "--count", "1500"]
+    words += ["--blocks", "1,3", "--presets", "draft", "--rho", "0.2"]
+    monkeypatch.setattr(sys, "argv", words)
+    large.main()
+    *_, whole, same, blocks = capsys.readouterr().out.splitlines()[-1].strip("| ").split(" | ")
+    assert float(whole.split()[0]) > 10
+    assert same == "+0.00 (+0.0000)"
+    assert blocks != same
