@@ -101,6 +101,11 @@ class LocalWorkers:
         count = checked_whole(count, "the number of processes")
         self._count, self._remedy = pool_size(count), remedy
 
+    @property
+    def count(self) -> int:
+        """Number of processes."""
+        return self._count
+
     def __enter__(self) -> Self:
         from cvtgs.devices import core_count  # noqa: PLC0415 (loads torch; see _begin)
 

@@ -9,6 +9,7 @@ import torch
 
 from cvtgs import load, save, synthetic
 from cvtgs.cli.main import main
+from cvtgs.streams.files import INDEX_NAMES
 from scenes import random_scene
 
 
@@ -228,18 +229,29 @@ def test_a_stream_does_not_replace_its_scene(
         error = " ".join(capsys.readouterr().err.split())
         assert f"{out / name}: a level must not replace the scene; choose another folder." in error
     assert before == {one: one.read_bytes() for one in out.rglob("*") if one.is_file()}
+    (out / INDEX_NAMES[kind]).write_text("{}")  # of another tool, or damaged
+    assert main(["levels", str(out / chunk), *words, "--overwrite"]) == 1
+    before[out / INDEX_NAMES[kind]] = b"{}"
+    assert before == {one: one.read_bytes() for one in out.rglob("*") if one.is_file()}
     beside = out / "b.ply"
     path.rename(beside)
     assert main(["levels", str(beside), *words, "--overwrite"]) == 0
     assert beside.exists()
 
 
-@pytest.mark.parametrize(("count", "levels"), [(1, [1]), (2, [2, 1]), (10, [10, 3, 1])])
+@pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
+@pytest.mark.parametrize(
+    ("count", "valid", "levels"),
+    [(1, 1, [1]), (2, 2, [2, 1]), (10, 10, [10, 3, 1]), (10, 2, [2, 1]), (200, 40, [40, 12, 3])],
+)
 def test_the_levels_of_a_small_stream_differ_in_size(
-    tmp_path: Path, count: int, levels: list[int]
+    tmp_path: Path, count: int, valid: int, levels: list[int]
 ) -> None:
     path, out = tmp_path / "a.ply", tmp_path / "out"
-    save(random_scene(count), path)
+    scene = random_scene(count)
+    means = scene.means.clone()
+    means[valid:] = torch.nan
+    save(scene.with_tensors({"means": means}), path)
     words = ["levels", str(path), "-o", str(out), "--stream", "sog", "--preset", "draft"]
     assert main(words) == 0
     assert [len(load(out, lod=lod)) for lod in range(len(levels))] == levels

@@ -14,7 +14,7 @@ import pytest
 import cvtgs
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.ply import open_rows
-from cvtgs.outofcore import simplify_file
+from cvtgs.outofcore import LocalWorkers, simplify_file
 from cvtgs.outofcore.memory import (
     BASE_BYTES,
     LEAST_BYTES,
@@ -241,11 +241,20 @@ def test_formats_that_are_written_from_memory_say_what_they_need(
     source = tmp_path / "in.ply"
     cvtgs.save(cvtgs.synthetic.scene("object", 3000, sh_degree=0, seed=0), source)
     row = open_rows(source).dtype.itemsize
-    for name, rows, warns in (("a.sog", 4, True), ("b.sog", 6, False), ("a.ply", 4, False)):
+    pair = LocalWorkers(2)  # share the memory, which is free for the file when they have ended
+    monkeypatch.setattr(LocalWorkers, "__call__", lambda _, function, items: map(function, items))
+    for name, rows, warns, workers in (
+        ("a.sog", 4, True, None),
+        ("b.sog", 6, False, None),
+        ("c.sog", 4, False, pair),
+        ("a.ply", 4, False, None),
+    ):
         monkeypatch.setattr("cvtgs.outofcore.memory.LIBRARY_BYTES", LEAST_BYTES - 300 * rows * row)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            simplify_file(source, tmp_path / name, count=300, memory=LEAST_BYTES, blocks=2)
+            simplify_file(
+                source, tmp_path / name, count=300, memory=LEAST_BYTES, blocks=2, workers=workers
+            )
         found = [str(one.message) for one in caught if "written all at once" in str(one.message)]
         assert len(found) == warns
         assert all("a.sog: " in text and "for 300 Gaussians, more than" in text for text in found)

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.synthetic import scene
 from cvtgs.views import find_view_positions, random_views
 
@@ -21,3 +22,5 @@ def test_random_views_of_a_room_stand_all_over_it_and_half_of_them_look_about_le
     assert len(torch.unique(places, dim=0)) > 40
     rises = (cameras.viewmats[:, 2, :3] @ layout.up).abs()
     assert float(rises[::2].amax()) < 0.5 < float(rises[1::2].amax())
+    with pytest.raises(InvalidArgumentError, match="reach must be two ascending numbers"):
+        random_views(positions, 2, size=32, seed=0, reach=(3.0, 1.0))

@@ -1,7 +1,9 @@
 """``cvtgs levels``: several sizes of one scene, and an index for viewers."""
 
 import argparse
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cvtgs
@@ -27,10 +29,17 @@ from cvtgs.cli.options import (
     read_settings,
 )
 from cvtgs.cli.paths import is_same_file
-from cvtgs.cli.streams import add_stream_options, check_stream_options, stream_blocks, stream_levels
+from cvtgs.cli.streams import (
+    add_stream_options,
+    check_stream_options,
+    of_different_sizes,
+    stream_blocks,
+    stream_levels,
+)
 from cvtgs.cli.view import check_page, write_page
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.text import counted, printable, size_text
+from cvtgs.validity import valid_rows
 
 if TYPE_CHECKING:
     from cvtgs.cameras import Cameras
@@ -110,7 +119,7 @@ def levels(options: argparse.Namespace) -> None:
         )
         scene = cvtgs.load(options.input, axes=axes.source, trust_sizes=options.trust_sizes)
         if options.stream is not None and options.rho is None:
-            rhos = _of_different_sizes(rhos, len(scene))
+            rhos = of_different_sizes(rhos, len(scene), int(valid_rows(scene).sum()))
         degree = scene.sh_degree if options.sh_degree is None else options.sh_degree
         cameras = _cameras_to_fit(options, scene) if config.uses_images else None
         views = _checked_views(options, scene) if is_scored else None
@@ -152,23 +161,20 @@ def levels(options: argparse.Namespace) -> None:
     write_page(options, {title: scene, **small})
 
 
-def _of_different_sizes(rhos: Sequence[float], total: int) -> list[float]:
-    """Return descending ratios without those whose levels have the size of a larger one."""
-    sizes = {cvtgs.target_count(total, rho): rho for rho in reversed(rhos)}
-    return sorted(sizes.values(), reverse=True)
-
-
 def _check_input(options: argparse.Namespace, names: Sequence[str]) -> None:
     """Raise if a level would replace the scene, whose name nobody gave as an output."""
-    from cvtgs.streams.files import replaced_names
+    from cvtgs.streams.files import is_replaced
 
-    file = cvtgs.io.scene_file(options.input)
-    if options.stream is not None:
-        names = replaced_names(options.output, options.stream)
-    for level in (options.output / name for name in names):
-        if any(is_same_file(level, place) for place in (file, file.parent)):  # a SOG is a folder
+    file = Path(os.path.realpath(cvtgs.io.scene_file(options.input)))
+    for place in (file, file.parent):  # a SOG is a folder
+        replaced = any(is_same_file(options.output / name, place) for name in names)
+        if options.stream is not None:
+            is_inside = is_same_file(place.parent, options.output)
+            replaced = is_inside and is_replaced(place.name, options.stream)
+        if replaced:
             raise InvalidArgumentError(
-                f"{level}: a level must not replace the scene; choose another folder."
+                f"{options.output / place.name}: a level must not replace the scene; choose "
+                f"another folder."
             )
 
 

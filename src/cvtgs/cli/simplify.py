@@ -324,9 +324,10 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
     try:
         for name in ("target_psnr", "target_ssim", "time_budget"):
             if getattr(options, name) is not None:
+                images = "" if name == "time_budget" else " and 400 MB for images of it"
                 raise InvalidArgumentError(
-                    f"--{name.replace('_', '-')} cannot be used with blocks: the whole scene is "
-                    f"needed at once."
+                    f"--{name.replace('_', '-')} cannot be used with blocks: it needs memory for "
+                    f"the whole scene{images} at once."
                 )
         check_block_device(options)
         check_config(config)

@@ -167,6 +167,9 @@ def stream_blocks(
         raise InvalidArgumentError(
             "blocks cannot be used with --cameras, which need the whole scene."
         )
+    if options.rho is None:
+        total = open_rows(options.input).count
+        rhos = of_different_sizes(rhos, total, total)
     with (
         progress_bars(quiet=options.quiet) as listener,
         block_workers(options, memory) as (workers, share),
@@ -190,6 +193,12 @@ def stream_blocks(
     done = f", {report.resumed_blocks} of them from an earlier run" if report.resumed_blocks else ""
     _print_levels(options, report.chunks, report.levels, f" and {report.blocks} blocks{done}")
     return True
+
+
+def of_different_sizes(rhos: Sequence[float], total: int, valid: int) -> list[float]:
+    """Return descending ratios without those whose levels have the size of a larger one."""
+    sizes = {min(cvtgs.target_count(total, rho), valid): rho for rho in sorted(rhos)}
+    return sorted(sizes.values(), reverse=True)
 
 
 def stream_levels(

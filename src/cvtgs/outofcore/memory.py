@@ -13,7 +13,7 @@ from cvtgs.devices import core_count
 from cvtgs.errors import InvalidArgumentError, warn
 from cvtgs.io.ply import PlyRows
 from cvtgs.outofcore.scan import SAMPLE_ROWS
-from cvtgs.processes import pool_size
+from cvtgs.processes import Workers, pool_size
 from cvtgs.text import counted, size_text
 
 LIBRARY_BYTES = 280_000_000 if torch.version.cuda is None else 430_000_000
@@ -82,15 +82,16 @@ def check_memory(memory: int | None, *, with_images: bool) -> None:
 
 
 def warn_of_writing(
-    output: str | os.PathLike[str], source: PlyRows, *, target: int, memory: int
+    output: str | os.PathLike[str], source: PlyRows, *, target: int, memory: int, workers: Workers
 ) -> None:
-    """Warn if an output that is written from memory takes more than there is."""
+    """Warn if an output that is written from memory, after all workers, takes more than they do."""
+    memory = min(memory * getattr(workers, "count", 1), max(memory, available_memory()))
     needed = LIBRARY_BYTES + WRITING_ROWS * source.dtype.itemsize * target
     if needed > memory:
         warn(
             f"{os.fspath(output)}: this format is written all at once, which needs about "
-            f"{size_text(needed)} for {counted(target, 'Gaussian')}, more than the "
-            f"{size_text(memory)} of one process; a .ply is written part by part."
+            f"{size_text(needed)} for {counted(target, 'Gaussian')}, more than "
+            f"{size_text(memory)}; a .ply is written part by part."
         )
 
 

@@ -154,7 +154,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     memory = None if memory is None else whole_number(memory)
     room = memory or memory_to_plan()
     if not is_plain_ply(output):
-        warn_of_writing(output, rows, target=target, memory=room)
+        warn_of_writing(output, rows, target=target, memory=room, workers=workers)
     if simplifier.config.uses_images:
         room -= IMAGE_BYTES
         if cameras is not None:

@@ -37,8 +37,11 @@ INDEX_NAMES = {"sog": "lod-meta.json", "3dtiles": "tileset.json"}
 """The file that a viewer opens, by the kind of the stream."""
 
 
+_OWN = r"\d+_\d+\.glb|\d+_\d+_\d+|environment"
+"""Matches the names of files and folders that cvtgs itself can have written."""
+
 _OWN_NAME = re.compile(r'"(\d+_\d+\.glb|\d+_\d+_\d+(?=/meta\.json")|environment(?=/meta\.json"))')
-"""Matches the file and folder names in an index that cvtgs itself can have written."""
+"""Matches these names in an index."""
 
 
 class StreamLevel(NamedTuple):
@@ -221,9 +224,9 @@ def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
         _remove(aside)
 
 
-def replaced_names(folder: Path, kind: str) -> list[str]:
-    """Return the files and folders of an earlier stream that a new one would replace."""
-    return [INDEX_NAMES[kind], *sorted(_names_of(folder / INDEX_NAMES[kind]))]
+def is_replaced(name: str, kind: str) -> bool:
+    """Return whether a stream may replace a file or folder of this name in its folder."""
+    return name == INDEX_NAMES[kind] or re.fullmatch(_OWN, name) is not None
 
 
 def _names_of(index: Path) -> set[str]:

@@ -11,7 +11,7 @@ from cvtgs.cameras import Cameras, join_cameras, look_at
 from cvtgs.counts import checked_whole
 from cvtgs.scene import SceneLike
 from cvtgs.views.automatic import automatic_views
-from cvtgs.views.positions import CameraPositions, as_positions, checked_seed
+from cvtgs.views.positions import CameraPositions, as_positions, checked_reach, checked_seed
 from cvtgs.views.scoring import SMOOTH, splat_sizes
 
 TRIED = 3  # number of candidate views per returned view
@@ -72,8 +72,8 @@ def random_views(
     count = checked_whole(count, "count", least=0)
     positions = as_positions(scene)
     layout = positions.layout
-    if layout.room is not None:
-        reach = (0.0, reach[1])
+    low, high = checked_reach(reach)
+    reach = (low if layout.room is None else 0.0, high)
     eyes = positions.near(count, reach, seed)
     targets = _targets(positions, eyes, seed)
     field = _OPEN_FIELD if layout.is_open else _FIELD

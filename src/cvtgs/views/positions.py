@@ -136,14 +136,9 @@ class CameraPositions:
             InvalidArgumentError: ``reach`` does not consist of two ascending numbers from 0, or
                 count or seed are no whole numbers.
         """
-        ends = tuple(map(real_number, reach)) if isinstance(reach, Sequence) else ()
-        if len(ends) != 2 or not 0 <= ends[0] <= ends[1]:
-            raise InvalidArgumentError(
-                f"reach must be two ascending numbers of at least 0, found {shown(reach)}."
-            )
+        low, high = checked_reach(reach)
         count = checked_whole(count, "count", least=0)
         generator = torch.Generator().manual_seed(checked_seed(seed))
-        low, high = ends
         beyond = (low - self.distances).clamp_min(self.distances - high).clamp_min(0)
         within = (beyond <= beyond.amin()).nonzero()[:, 0]
         picked = within[torch.randint(len(within), (count,), generator=generator, device="cpu")]
@@ -151,6 +146,16 @@ class CameraPositions:
         draws = torch.rand(count, 3, generator=generator, dtype=torch.float32, device="cpu")
         moved = eyes + 0.1 * self.layout.frame.radius * (draws - 0.5)
         return torch.where(self.admit(moved)[:, None], moved, eyes)
+
+
+def checked_reach(reach: tuple[float, float]) -> tuple[float, float]:
+    """Return a range of distances; raise unless it is one."""
+    ends = tuple(map(real_number, reach)) if isinstance(reach, Sequence) else ()
+    if len(ends) != 2 or not 0 <= ends[0] <= ends[1]:
+        raise InvalidArgumentError(
+            f"reach must be two ascending numbers of at least 0, found {shown(reach)}."
+        )
+    return ends[0], ends[1]
 
 
 @torch.no_grad()
