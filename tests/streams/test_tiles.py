@@ -5,7 +5,8 @@ import math
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import torch
@@ -220,3 +221,14 @@ def test_the_error_of_the_whole_tileset_is_in_the_units_of_its_place(tmp_path: P
     )
     assert scaled["geometricError"] == pytest.approx(100 * plain["geometricError"])
     assert scaled["root"]["geometricError"] == plain["root"]["geometricError"]
+
+
+def test_levels_of_ones_own_need_no_sums_of_errors(tmp_path: Path) -> None:
+    levels = FAST.levels(make("object", 2000, sh_degree=0, seed=2), [1.0, 0.1])
+    names = ("scene", "geometric_error", "assignment")
+    own = [SimpleNamespace(**{name: getattr(one, name) for name in names}) for one in levels]
+    write_tiles(plan_stream(cast("Any", own)), tmp_path / "own")
+    write_tiles(plan_stream(levels), tmp_path / "out")
+    trees = [json.loads((tmp_path / name / "tileset.json").read_text()) for name in ("own", "out")]
+    # One tile holds the whole level.
+    assert trees[0]["root"]["geometricError"] == pytest.approx(trees[1]["root"]["geometricError"])
