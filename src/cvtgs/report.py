@@ -29,7 +29,8 @@ class RefineReport(Record):
             the matching were enough.
         heldout: Number of held-out views, which decide what is kept.
         psnr_before: Mean PSNR of the input scene over the held-out views, dB; each view counts at
-            most 10 dB above their median.
+            most 10 dB above their median. Of blocks, steps and views are sums, and PSNR are means
+            over blocks, in whose images the other blocks do not change.
         psnr_after: The same for the refined scene; never less.
         gain: Difference of the two, dB.
         changed_count: Number of Gaussians that changed.

@@ -67,6 +67,17 @@ def test_a_scene_too_small_for_the_near_plane_is_warned_about_once(scene, tmp_pa
     assert sum("of the Gaussians before their cameras" in text for text in texts) == 1
 
 
+def test_nobody_is_asked_for_better_cameras_than_generated_ones(scene, tmp_path):
+    """They are far away from Gaussians that all have one position."""
+    point = scene.with_tensors({"means": torch.full_like(scene.means, 3.0)})[:800]
+    cvtgs.save(point, tmp_path / "in.ply")
+    settings = REFINED | {"refine": REFINED["refine"] | {"steps": 2, "images": 4}}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        in_blocks(tmp_path / "in.ply", tmp_path / "out.ply", settings, count=80, blocks=2)
+    assert not [str(one.message) for one in caught if "cameras" in str(one.message)]
+
+
 def psnr_of(scene, small):
     cameras = automatic_views(scene, 4, width=96, height=72)
     settings = EvaluationSettings(lpips="off")

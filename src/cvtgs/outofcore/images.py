@@ -13,6 +13,7 @@ grouped again, with more cells where the images err.
 import json
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import partial
 from statistics import mean
 from typing import Any, NamedTuple
@@ -29,6 +30,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
 from cvtgs.devices import one_thread
 from cvtgs.edit import concatenate
+from cvtgs.errors import without_warnings
 from cvtgs.grouping import importance_by_errors
 from cvtgs.io import load
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
@@ -186,16 +188,18 @@ def improve(job: Job, block: int) -> None:
             frozen=drawn.fixed,
         )
     if later is not None:
-        small, changes["refinement"] = refine(
-            small,
-            drawn.full,
-            cameras=later,
-            config=config.refine,
-            seed=config.seed,
-            device="cpu",
-            frozen=drawn.fixed,
-            observed=observed if config.shares_images else None,
-        )
+        # Nobody gave generated views, so nobody can give better ones.
+        with nullcontext() if job.cameras is not None else without_warnings():
+            small, changes["refinement"] = refine(
+                small,
+                drawn.full,
+                cameras=later,
+                config=config.refine,
+                seed=config.seed,
+                device="cpu",
+                frozen=drawn.fixed,
+                observed=observed if config.shares_images else None,
+            )
     improved = own.with_tensors(small[drawn.fixed :].tensors(), own.extras)
     improved = restore_columns(improved, found.original, job.read_scan().plan)
     changes["mass_out"] = float(improved.masses.sum())
