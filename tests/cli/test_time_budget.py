@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,7 @@ def test_a_run_whose_file_takes_too_long_says_so(
 
 @pytest.mark.parametrize("name", ["out.ply", "out.sog"])
 def test_the_seconds_of_writing_follow_from_a_sample(
-    scene: cvtgs.GaussianScene, monkeypatch: pytest.MonkeyPatch, name: str
+    scene: cvtgs.GaussianScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     """A second for libraries, 0.01 for a file, and 0.001 for each Gaussian."""
 
@@ -90,3 +91,5 @@ def test_the_seconds_of_writing_follow_from_a_sample(
     partly = scene.with_tensors({"means": first})
     assert _seconds_to_write(options(name), partly, 30_000) == pytest.approx(30.0, rel=0.01)
     assert _seconds_to_write(options(name), none, 30_000) == 0.0
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    assert _seconds_to_write(options(name), scene, 30_000) == 0.0

@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import cvtgs
 from cvtgs.cli.cameras import AUTOMATIC_VIEWS, SCORED_SIZE, own_cameras
 from cvtgs.cli.display import say, target_note
-from cvtgs.errors import DroppedDataWarning, GoalError, InvalidArgumentError, without_warnings
+from cvtgs.errors import (
+    CvtgsError,
+    DroppedDataWarning,
+    GoalError,
+    InvalidArgumentError,
+    without_warnings,
+)
 from cvtgs.text import counted
 
 if TYPE_CHECKING:
@@ -134,17 +140,20 @@ def choose_preset(
 
 
 def _seconds_to_write(options: argparse.Namespace, scene: "GaussianScene", count: int) -> float:
-    """Estimate the seconds that a scene of some Gaussians takes to write in the format of OUT."""
+    """Estimate the seconds that a scene of some Gaussians takes to write in the format of OUT.
+
+    They are 0 if no sample can be written, which the file of the scene may tell better.
+    """
     some = scene[: min(count, SAMPLED)]
-    some = some[cvtgs.validity.writable_rows(some)]
-    if len(some) == 0:
+    some, seconds = some[cvtgs.validity.writable_rows(some)], list[float]()
+    try:
+        with TemporaryDirectory() as folder, without_warnings(DroppedDataWarning):
+            for sample in (some[:1], some[:1], some, some):  # the first loads libraries
+                started = time.perf_counter()
+                cvtgs.io.save(sample, Path(folder) / options.output.name, overwrite=True)
+                seconds.append(time.perf_counter() - started)
+    except (OSError, CvtgsError):
         return 0.0
-    with TemporaryDirectory() as folder, without_warnings(DroppedDataWarning):
-        seconds = []
-        for sample in (some[:1], some[:1], some, some):  # the first loads libraries
-            started = time.perf_counter()
-            cvtgs.io.save(sample, Path(folder) / options.output.name, overwrite=True)
-            seconds.append(time.perf_counter() - started)
     _, fixed, *whole = seconds
     return fixed + max(0.0, min(whole) - fixed) * count / len(some)
 

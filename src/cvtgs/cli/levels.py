@@ -173,8 +173,7 @@ def _check_input(options: argparse.Namespace, names: Sequence[str]) -> None:
             replaced = is_inside and is_replaced(place.name, options.stream)
         if replaced:
             raise InvalidArgumentError(
-                f"{options.output / place.name}: a level must not replace the scene; choose "
-                f"another folder."
+                f"{options.input}: a level must not replace the scene; choose another folder."
             )
 
 
