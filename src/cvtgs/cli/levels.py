@@ -39,7 +39,6 @@ from cvtgs.cli.streams import (
 from cvtgs.cli.view import check_page, write_page
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.text import counted, printable, size_text
-from cvtgs.validity import valid_rows
 
 if TYPE_CHECKING:
     from cvtgs.cameras import Cameras
@@ -119,7 +118,7 @@ def levels(options: argparse.Namespace) -> None:
         )
         scene = cvtgs.load(options.input, axes=axes.source, trust_sizes=options.trust_sizes)
         if options.stream is not None and options.rho is None:
-            rhos = of_different_sizes(rhos, len(scene), int(valid_rows(scene).sum()))
+            rhos = of_different_sizes(rhos, len(scene), int(cvtgs.validity.valid_rows(scene).sum()))
         degree = scene.sh_degree if options.sh_degree is None else options.sh_degree
         cameras = _cameras_to_fit(options, scene) if config.uses_images else None
         views = _checked_views(options, scene) if is_scored else None
