@@ -8,6 +8,8 @@ import sys
 import time
 from pathlib import Path
 from pkgutil import resolve_name
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -33,6 +35,17 @@ def cluster():
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
     ) as found:
         yield found
+
+
+def test_a_scheduler_that_has_just_ended_has_no_workers(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Its client knows of none, and does not even say so."""
+    monkeypatch.setattr(distributed, "ANSWER_SECONDS", 0.1)
+    client = SimpleNamespace(scheduler=None, scheduler_info=lambda n_workers: {"type": "Scheduler"})
+    job = SimpleNamespace(path=lambda name: tmp_path / name)
+    with pytest.raises(RunError, match="ADDRESS: must have workers, found none"):
+        ClusterWorkers(cast("Any", client)).check(cast("Any", job))
 
 
 @pytest.mark.long

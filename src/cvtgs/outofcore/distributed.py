@@ -191,7 +191,8 @@ class ClusterWorkers:
         return addresses
 
     def _addresses(self) -> list[str]:
-        return sorted(self._client.scheduler_info(n_workers=-1)["workers"])
+        # A client that has just lost its scheduler knows of no workers.
+        return sorted(self._client.scheduler_info(n_workers=-1).get("workers", ()))
 
     def __call__(
         self, function: Callable[[Item], Result], items: Sequence[Item]
