@@ -42,7 +42,11 @@ _SAMPLE = 1 << 16  # points used for these quantiles
 
 
 class StreamedLevel(Protocol):
-    """What a stream needs of a level, such as :class:`cvtgs.report.Level`."""
+    """What a stream needs of a level, such as :class:`cvtgs.report.Level`.
+
+    If it has ``error_sums``, too, as that class describes them, tiles state errors of their own,
+    else that of the level.
+    """
 
     @property
     def scene(self) -> GaussianScene:
@@ -57,11 +61,6 @@ class StreamedLevel(Protocol):
     @property
     def assignment(self) -> Int[Tensor, "n"] | None:
         """Row of the Gaussian that replaces each input row, -1 for none; None if all are kept."""
-        ...
-
-    @property
-    def error_sums(self) -> Float[Tensor, "2 m"] | None:
-        """Sums from which parts have their errors; None if all have that of the level."""
         ...
 
 

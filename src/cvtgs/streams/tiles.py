@@ -321,7 +321,7 @@ def _entry(
 def _error(plan: StreamPlan, tile: _Tile) -> float:
     """Return the error of the Gaussians of a tile, which may be far from that of their level."""
     level = plan.levels[tile.level]
-    sums = getattr(level, "error_sums", None)  # levels of one's own may have none
+    sums = getattr(level, "error_sums", None)  # optional
     return level.geometric_error if sums is None else rms_error(sums[:, _rows(plan, tile)])
 
 
