@@ -4,14 +4,10 @@ import argparse
 import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING
 
 from cvtgs.cli.display import say
 from cvtgs.errors import InvalidArgumentError, OutputBusyError, OutputError, RunError, warn
 from cvtgs.text import size_text
-
-if TYPE_CHECKING:
-    from cvtgs.outofcore import Workers
 
 
 def add_block_options(parser: argparse.ArgumentParser) -> None:
@@ -63,7 +59,7 @@ def check_block_device(options: argparse.Namespace) -> None:
 @contextmanager
 def block_workers(
     options: argparse.Namespace, memory: int
-) -> Iterator[tuple["Workers | None", int]]:
+) -> Iterator[tuple["cvtgs.outofcore.Workers | None", int]]:
     """Return workers, None for this process alone, and the bytes that each may use.
 
     After an interrupt or a failure, print where the finished steps are.

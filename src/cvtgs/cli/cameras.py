@@ -15,11 +15,6 @@ from cvtgs.text import counted
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from cvtgs.cameras import Cameras
-    from cvtgs.evaluation import Evaluation, EvaluationSettings
-    from cvtgs.scene import GaussianScene
-    from cvtgs.views import OwnCameras
-
 Color = tuple[float, float, float]
 
 COLORS: Mapping[str, Color] = {
@@ -35,7 +30,7 @@ _MOST_VIEWS = 10_000
 _MOST_SIZE = 1 << 14  # pixels; images of 4 : 3 take some gigabytes then
 
 
-def say_views(evaluation: "Evaluation") -> None:
+def say_views(evaluation: "cvtgs.evaluation.Evaluation") -> None:
     """Print the number, size and renderer of the images that scores are means over."""
     say(
         f"{counted(evaluation.view_count, 'view')} "
@@ -79,7 +74,7 @@ def check_split(options: argparse.Namespace) -> None:
         raise InvalidArgumentError("--split chooses among cameras and needs --cameras.")
 
 
-def read_cameras(options: argparse.Namespace) -> "Cameras | None":
+def read_cameras(options: argparse.Namespace) -> "cvtgs.Cameras | None":
     """Read ``--cameras`` and ``--split``; None if not given."""
     if options.cameras is None:
         return None
@@ -103,7 +98,7 @@ def background_color(options: argparse.Namespace) -> Color:
     return red, green, blue
 
 
-def evaluation_settings(options: argparse.Namespace) -> "EvaluationSettings":
+def evaluation_settings(options: argparse.Namespace) -> "cvtgs.evaluation.EvaluationSettings":
     """Return the settings of rendering and scoring; without the option, LPIPS is ``auto``."""
     return cvtgs.evaluation.EvaluationSettings(
         background=background_color(options),
@@ -114,11 +109,11 @@ def evaluation_settings(options: argparse.Namespace) -> "EvaluationSettings":
 
 def choose_cameras(
     options: argparse.Namespace,
-    scene: "GaussianScene",
+    scene: "cvtgs.GaussianScene",
     *,
     most: int | None = None,
     held_out: bool = False,
-) -> "Cameras":
+) -> "cvtgs.Cameras":
     """Read ``--cameras`` or the cameras beside the scene; otherwise choose automatic views.
 
     With ``held_out``, only the test split of the cameras beside the scene is used, if there is one.
@@ -144,8 +139,8 @@ def choose_cameras(
 
 
 def own_cameras(
-    options: argparse.Namespace, scene: "GaussianScene", path: Path
-) -> "OwnCameras | None":
+    options: argparse.Namespace, scene: "cvtgs.GaussianScene", path: Path
+) -> "cvtgs.views.OwnCameras | None":
     """Find the cameras beside a scene, unless ``--axes`` turns the scene away from them."""
     from cvtgs.io.axes import SCENE_AXES
 
@@ -154,7 +149,7 @@ def own_cameras(
     return cvtgs.views.find_own_cameras(scene, path)
 
 
-def read_photographs(options: argparse.Namespace, cameras: "Cameras") -> "Tensor":
+def read_photographs(options: argparse.Namespace, cameras: "cvtgs.Cameras") -> "Tensor":
     """Read the photographs of ``--images``."""
     background = background_color(options)
     return cvtgs.evaluation.load_photographs(options.images, cameras, background=background)

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped
@@ -13,9 +12,6 @@ from cvtgs.cli.options import AddParser, add_options, count
 from cvtgs.cli.paths import new_folder
 from cvtgs.errors import OutputExistsError
 from cvtgs.text import size_text
-
-if TYPE_CHECKING:
-    from cvtgs.clock import StageCost
 
 RATIOS = (0.1, 0.01)
 VIEWS, WIDTH, HEIGHT = 6, 480, 360
@@ -117,7 +113,7 @@ def _check_folder(folder: Path) -> None:
         )
 
 
-def _column(path: Path, count: int, stages: "Sequence[StageCost]") -> dict[str, str]:
+def _column(path: Path, count: int, stages: "Sequence[cvtgs.clock.StageCost]") -> dict[str, str]:
     size = size_text(path.stat().st_size)
     column = {"file": path.name, "Gaussians": f"{count:,}", "size": size}
     column |= {f"{cost.stage}, s": f"{cost.seconds:.2f}" for cost in stages}

@@ -5,15 +5,12 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TextIO
 
+import cvtgs
 from cvtgs.errors import OutputError, reason_of
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.text import columns, counted, printable
-
-if TYPE_CHECKING:
-    from cvtgs.budget import Found
-    from cvtgs.report import SimplifyReport
 
 WIDTH = 80  # maximum columns of a line of output
 
@@ -102,7 +99,7 @@ def progress_bars(*, quiet: bool, transient: bool = False) -> Iterator[ProgressL
         yield listen
 
 
-def target_note(found: "Found", views: str) -> str:
+def target_note(found: "cvtgs.budget.Found", views: str) -> str:
     """Return the scores of a search, and the views that they are measured over."""
     from cvtgs.evaluation.scorer import MOST_PSNR
 
@@ -114,12 +111,12 @@ def target_note(found: "Found", views: str) -> str:
     )
 
 
-def shortfall_note(report: "SimplifyReport") -> str:
+def shortfall_note(report: "cvtgs.SimplifyReport") -> str:
     """Return why a result is smaller than asked for."""
     return f"Fewer than the requested {report.target_count:,}: {report.shortfall}."
 
 
-def report_notes(report: "SimplifyReport") -> list[str]:
+def report_notes(report: "cvtgs.SimplifyReport") -> list[str]:
     """Return the sentences to print besides counts, sizes and seconds."""
     notes = []
     if report.device_note:

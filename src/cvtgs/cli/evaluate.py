@@ -5,7 +5,6 @@ import re
 from collections.abc import Sequence
 from functools import partial
 from pathlib import PurePosixPath, PureWindowsPath
-from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.cameras import (
@@ -26,11 +25,6 @@ from cvtgs.errors import InvalidArgumentError, RunError, warn
 from cvtgs.io.atomic import windows_fault, write_atomically
 from cvtgs.progress import ProgressEvent
 from cvtgs.text import MOST_LETTERS, counted, printable_name, size_text
-
-if TYPE_CHECKING:
-    from cvtgs.evaluation import Evaluation, SceneScores
-    from cvtgs.scene import GaussianScene
-    from cvtgs.tradeoff import Tradeoff
 
 MOST_CAMERAS = 8
 """Maximum number of cameras that a page shows, and that ``tradeoff`` scores from, by default."""
@@ -103,7 +97,7 @@ def file_names(views: Sequence[str]) -> list[str]:
 
 def _read_scenes(
     options: argparse.Namespace,
-) -> "tuple[dict[str, GaussianScene], dict[str, int]]":
+) -> "tuple[dict[str, cvtgs.GaussianScene], dict[str, int]]":
     """Read REF and every SMALL, in this order; return scenes and file sizes by name."""
     from cvtgs.devices import chosen_device
 
@@ -162,7 +156,7 @@ def evaluate(options: argparse.Namespace) -> None:
         _print_scores(evaluation, sizes)
 
 
-def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
+def _print_scores(evaluation: "cvtgs.evaluation.Evaluation", sizes: dict[str, int]) -> None:
     say_views(evaluation)
     say(f"against {evaluation.reference}, {counted(evaluation.reference_count, 'Gaussian')}:")
     _print_score_table(evaluation.scenes, sizes)
@@ -174,7 +168,9 @@ def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
         say_wrapped(evaluation.lpips_sentence)
 
 
-def _print_score_table(scenes: "tuple[SceneScores, ...]", sizes: dict[str, int]) -> None:
+def _print_score_table(
+    scenes: "tuple[cvtgs.evaluation.SceneScores, ...]", sizes: dict[str, int]
+) -> None:
     rows = [["", "Gaussians", "size", "PSNR", "SSIM", "LPIPS"]]
     if scenes[0].alpha_error:
         rows[0] += ["alpha", "bias"]
@@ -305,7 +301,7 @@ def tradeoff(options: argparse.Namespace) -> None:
         raise RunError(f"{failed} of {runs} failed; {options.output} has the others.")
 
 
-def _print_tradeoff(tradeoff: "Tradeoff") -> None:
+def _print_tradeoff(tradeoff: "cvtgs.tradeoff.Tradeoff") -> None:
     from cvtgs.tradeoff.files import MARK_MEANS, cells, heading, how_measured
 
     for rho in tradeoff.rhos:

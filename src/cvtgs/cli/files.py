@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import cvtgs
 from cvtgs.cli.display import say, say_wrapped
@@ -33,14 +33,6 @@ from cvtgs.cli.paths import any_path
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn, without_warnings
 from cvtgs.tags import TWO_SCALES, described_tags
 from cvtgs.text import counted, first_of, size_text
-
-if TYPE_CHECKING:
-    import pydantic
-
-    from cvtgs.analysis import Effect
-    from cvtgs.info import SceneInfo
-    from cvtgs.mergenet import Checkpoint
-    from cvtgs.scene import GaussianScene
 
 _NUMBERS = {
     "--crop-box": "six numbers x,y,z,X,Y,Z, the minimum and maximum coordinates",
@@ -98,7 +90,7 @@ def add_edit_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-Edit = Callable[["GaussianScene"], "GaussianScene"]
+Edit = Callable[["cvtgs.GaussianScene"], "cvtgs.GaussianScene"]
 
 
 def read_edits(options: argparse.Namespace) -> list[tuple[str, Edit]]:
@@ -142,8 +134,8 @@ def _numbers(name: str, text: str, count: int) -> list[float]:
 
 
 def edited(
-    scene: "GaussianScene", edits: Iterable[tuple[str, Edit]]
-) -> "tuple[GaussianScene, list[str]]":
+    scene: "cvtgs.GaussianScene", edits: Iterable[tuple[str, Edit]]
+) -> "tuple[cvtgs.GaussianScene, list[str]]":
     """Return the edited scene, and one phrase for each kind of lost data."""
     from cvtgs.io.limits import LOST_DIGITS
     from cvtgs.validity import lost_step
@@ -197,7 +189,9 @@ def show_info(options: argparse.Namespace) -> None:
 
 
 def _show(
-    options: argparse.Namespace, facts: "pydantic.BaseModel", rows: Sequence[tuple[str, str]]
+    options: argparse.Namespace,
+    facts: "cvtgs.SceneInfo | cvtgs.mergenet.CheckpointInfo",
+    rows: Sequence[tuple[str, str]],
 ) -> None:
     """Print facts as JSON, or as rows of labels and texts."""
     if options.json:
@@ -207,7 +201,7 @@ def _show(
         say(f"{label:<16} {text}")
 
 
-def checkpoint_rows(checkpoint: "Checkpoint") -> list[tuple[str, str]]:
+def checkpoint_rows(checkpoint: "cvtgs.mergenet.Checkpoint") -> list[tuple[str, str]]:
     """Return how a checkpoint was trained, by label."""
     info, unknown = checkpoint.info, "unknown"
     rows = [
@@ -227,7 +221,7 @@ def checkpoint_rows(checkpoint: "Checkpoint") -> list[tuple[str, str]]:
     return rows
 
 
-def _rows(facts: "SceneInfo") -> list[tuple[str, str]]:
+def _rows(facts: "cvtgs.SceneInfo") -> list[tuple[str, str]]:
     from cvtgs.info import HEAVIEST, QUANTILES
 
     invalid = ", ".join(f"{name} {number:,}" for name, number in facts.invalid_rows.items())
@@ -264,7 +258,7 @@ def _rows(facts: "SceneInfo") -> list[tuple[str, str]]:
     ]
 
 
-def _effect_cells(effect: "Effect") -> tuple[str, str, str]:
+def _effect_cells(effect: "cvtgs.analysis.Effect") -> tuple[str, str, str]:
     """Return the state of an effect, the measured figures, and the rule that decides."""
     from cvtgs.analysis import BandsEffect
 

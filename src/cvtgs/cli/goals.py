@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import cvtgs
 from cvtgs.cli.cameras import AUTOMATIC_VIEWS, SCORED_SIZE, own_cameras
@@ -20,14 +20,6 @@ from cvtgs.errors import (
     without_warnings,
 )
 from cvtgs.text import counted
-
-if TYPE_CHECKING:
-    from cvtgs.budget import Found
-    from cvtgs.cameras import Cameras
-    from cvtgs.config import SimplifyConfig
-    from cvtgs.progress import ProgressListener
-    from cvtgs.scene import GaussianScene
-    from cvtgs.simplifier import Simplifier
 
 STARTED = time.perf_counter()  # approximate start of this process, from which a time budget counts
 SAMPLED = 1 << 13  # Gaussians that tell how long the output file takes
@@ -81,7 +73,9 @@ def check_goals(options: argparse.Namespace) -> None:
         )
 
 
-def with_limited_bands(config: "SimplifyConfig", degree: int | None) -> "SimplifyConfig":
+def with_limited_bands(
+    config: "cvtgs.SimplifyConfig", degree: int | None
+) -> "cvtgs.SimplifyConfig":
     """Return a configuration that drops the SH bands above a degree."""
     own = config.effects.sh
     if degree is None or own == "off" or (isinstance(own, int) and own <= degree):
@@ -92,9 +86,9 @@ def with_limited_bands(config: "SimplifyConfig", degree: int | None) -> "Simplif
 
 def choose_preset(
     options: argparse.Namespace,
-    scene: "GaussianScene",
+    scene: "cvtgs.GaussianScene",
     settings: Mapping[str, str],
-    listener: "ProgressListener",
+    listener: "cvtgs.ProgressListener",
     *,
     with_images: bool = True,
 ) -> ChosenPreset:
@@ -139,7 +133,9 @@ def choose_preset(
     return ChosenPreset(choice.preset, reason, budget - spent, advice)
 
 
-def _seconds_to_write(options: argparse.Namespace, scene: "GaussianScene", count: int) -> float:
+def _seconds_to_write(
+    options: argparse.Namespace, scene: "cvtgs.GaussianScene", count: int
+) -> float:
     """Estimate the seconds that a scene of some Gaussians takes to write in the format of OUT.
 
     They are 0 if no sample can be written, which the file of the scene may tell better.
@@ -160,13 +156,13 @@ def _seconds_to_write(options: argparse.Namespace, scene: "GaussianScene", count
 
 def search_target(
     options: argparse.Namespace,
-    scene: "GaussianScene",
-    simplifier: "Simplifier",
+    scene: "cvtgs.GaussianScene",
+    simplifier: "cvtgs.Simplifier",
     *,
-    cameras: "Cameras | None",
+    cameras: "cvtgs.Cameras | None",
     axes: str | None,
-    listener: "ProgressListener",
-) -> tuple["Found", str]:
+    listener: "cvtgs.ProgressListener",
+) -> tuple["cvtgs.budget.Found", str]:
     """Search for the smallest scene whose file, with the given axes, reaches the quality.
 
     Without ``--cameras``, the views are those of ``cvtgs evaluate``, unless a preset is fitted to
@@ -184,7 +180,7 @@ def search_target(
             heldout = own.cameras.spread(AUTOMATIC_VIEWS).fitted(SCORED_SIZE)
             views = f"{counted(len(heldout), 'camera')} found in {own.source.resolve()}"
 
-    def read_back(small: "GaussianScene") -> "GaussianScene":
+    def read_back(small: "cvtgs.GaussianScene") -> "cvtgs.GaussianScene":
         """Write a scene to a temporary file of the format of OUT, and read it again."""
         with TemporaryDirectory() as folder:
             file = Path(folder) / options.output.name

@@ -4,7 +4,6 @@ import argparse
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.cameras import (
@@ -39,14 +38,6 @@ from cvtgs.cli.streams import (
 from cvtgs.cli.view import check_page, write_page
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.text import counted, printable, size_text
-
-if TYPE_CHECKING:
-    from cvtgs.cameras import Cameras
-    from cvtgs.evaluation import Evaluation
-    from cvtgs.levels import LevelsIndex
-    from cvtgs.progress import ProgressListener
-    from cvtgs.scene import GaussianScene
-
 
 PLAIN_RHOS, STREAM_RHOS = "0.1,0.01,0.001", "1,0.25,0.06,0.015"
 
@@ -176,7 +167,9 @@ def _check_input(options: argparse.Namespace, names: Sequence[str]) -> None:
             )
 
 
-def _cameras_to_fit(options: argparse.Namespace, scene: "GaussianScene") -> "Cameras | None":
+def _cameras_to_fit(
+    options: argparse.Namespace, scene: "cvtgs.GaussianScene"
+) -> "cvtgs.Cameras | None":
     """Read the cameras for presets that use images: not the split, by which levels are scored."""
     if options.cameras is not None:
         return cvtgs.load_cameras(options.cameras, split=options.split and "train")
@@ -184,7 +177,7 @@ def _cameras_to_fit(options: argparse.Namespace, scene: "GaussianScene") -> "Cam
     return None if own is None else own.cameras
 
 
-def _checked_views(options: argparse.Namespace, scene: "GaussianScene") -> "Cameras":
+def _checked_views(options: argparse.Namespace, scene: "cvtgs.GaussianScene") -> "cvtgs.Cameras":
     """Return the views that score; raise before the long work if the levels cannot be scored."""
     from cvtgs.devices import chosen_device
     from cvtgs.evaluation.compare import check_scores
@@ -197,11 +190,11 @@ def _checked_views(options: argparse.Namespace, scene: "GaussianScene") -> "Came
 
 def _score(
     options: argparse.Namespace,
-    scene: "GaussianScene",
+    scene: "cvtgs.GaussianScene",
     names: Sequence[str],
-    views: "Cameras",
-    listener: "ProgressListener",
-) -> "Evaluation":
+    views: "cvtgs.Cameras",
+    listener: "cvtgs.ProgressListener",
+) -> "cvtgs.evaluation.Evaluation":
     """Score the files of the levels against the full scene."""
     from cvtgs.devices import chosen_device
 
@@ -215,7 +208,7 @@ def _score(
     return cvtgs.evaluate(full, files, views, settings=settings, listener=listener)
 
 
-def _print_index(index: "LevelsIndex") -> None:
+def _print_index(index: "cvtgs.levels.LevelsIndex") -> None:
     say(f"{index.source}, {counted(index.source_count, 'Gaussian')}:")
     rows = [["", "Gaussians", "size", "error", "PSNR", "alpha", "seconds"]]
     for level in index.levels:

@@ -18,9 +18,6 @@ from cvtgs.text import SETTING_LIKENESS, suggestion
 if TYPE_CHECKING:
     import pydantic
 
-    from cvtgs.config import SimplifyConfig
-    from cvtgs.scene import GaussianScene
-
 READABLE = (
     ".ply, .compressed.ply, .spz, .splat, .ksplat, .sog, meta.json or lod-meta.json of one, .glb, "
     ".gltf, .ckpt, .pt or the folder of a trained model"
@@ -350,9 +347,9 @@ def preset_of(options: argparse.Namespace) -> str | None:
 
 
 def read_scene(
-    options: argparse.Namespace, config: "SimplifyConfig", *, axes: str | None = None,
+    options: argparse.Namespace, config: "cvtgs.SimplifyConfig", *, axes: str | None = None,
     all_bands: bool = False,
-) -> "GaussianScene":  # fmt: skip
+) -> "cvtgs.GaussianScene":  # fmt: skip
     """Read ``IN`` without what ``--effects`` and ``--sh-degree`` exclude, or with all bands."""
     kept = None if all_bands else getattr(options, "sh_degree", None)
     limits = [limit for limit in (config.effects.sh, kept) if isinstance(limit, int)]

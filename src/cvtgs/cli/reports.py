@@ -4,15 +4,12 @@ import argparse
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cvtgs
 from cvtgs.cli.jobs import SceneJob
 from cvtgs.errors import OutputError, OutputExistsError, RunError
 from cvtgs.io.atomic import write_atomically
-
-if TYPE_CHECKING:
-    from cvtgs.report import SimplifyReport
 
 
 class ReportFile:
@@ -22,7 +19,7 @@ class ReportFile:
         self._options = options
         self._entries: list[dict[str, Any]] = []
 
-    def add(self, job: SceneJob, report: "SimplifyReport") -> None:
+    def add(self, job: SceneJob, report: "cvtgs.SimplifyReport") -> None:
         """Write the report of one scene; keep that of one of many."""
         if self._options.report is None:
             return

@@ -47,10 +47,7 @@ from cvtgs.progress import ProgressListener, silent
 from cvtgs.text import counted
 
 if TYPE_CHECKING:
-    from cvtgs.config import SimplifyConfig
     from cvtgs.io.ply import PlyRows
-    from cvtgs.report import SimplifyReport
-    from cvtgs.simplifier import Simplifier
 
 
 def add_simplify(add_parser: AddParser) -> None:
@@ -179,8 +176,11 @@ def simplify(options: argparse.Namespace) -> None:
 
 
 def _simplify_one(
-    job: SceneJob, checkpoint: str | None, config: "SimplifyConfig", settings: Mapping[str, str]
-) -> "tuple[Outcome, SimplifyReport]":
+    job: SceneJob,
+    checkpoint: str | None,
+    config: "cvtgs.SimplifyConfig",
+    settings: Mapping[str, str],
+) -> "tuple[Outcome, cvtgs.SimplifyReport]":
     """Simplify one scene, in memory or block by block; return the result to print and report."""
     options, notes = job.options, list[str]()
     options.begun = time.perf_counter() if job.is_one_of_many else STARTED
@@ -223,7 +223,7 @@ def _simplify_one(
     return outcome, report
 
 
-def _unused(settings: Mapping[str, str], config: "SimplifyConfig") -> list[str]:
+def _unused(settings: Mapping[str, str], config: "cvtgs.SimplifyConfig") -> list[str]:
     """Return the names of settings of images that a configuration does not render."""
     switches = {"visibility.views", "refine.steps", "refine.seconds"}  # may have said so
     rendered = {"visibility": config.uses_renders, "match": config.uses_renders}
@@ -238,10 +238,10 @@ def _unused(settings: Mapping[str, str], config: "SimplifyConfig") -> list[str]:
 def _simplify_in_memory(
     options: argparse.Namespace,
     checkpoint: str | None,
-    config: "SimplifyConfig",
+    config: "cvtgs.SimplifyConfig",
     settings: Mapping[str, str],
     listener: ProgressListener,
-) -> "tuple[SimplifyReport, list[str]]":
+) -> "tuple[cvtgs.SimplifyReport, list[str]]":
     """Read, simplify and save a scene; return the report and notes to print with it."""
     from cvtgs.outofcore.resume import remove_job_files
 
@@ -314,7 +314,7 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
     return {"refine.steps": str(steps), "refine.seconds": str(seconds), **exact}
 
 
-def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int | None:
+def block_memory(options: argparse.Namespace, config: "cvtgs.SimplifyConfig") -> int | None:
     """Return the bytes for simplifying in blocks; None if blocks are not needed or not possible."""
     from cvtgs.outofcore.run import check_config
 
@@ -338,7 +338,7 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
     return memory
 
 
-def _needs_blocks(options: argparse.Namespace, memory: int, config: "SimplifyConfig") -> bool:
+def _needs_blocks(options: argparse.Namespace, memory: int, config: "cvtgs.SimplifyConfig") -> bool:
     """Return whether a file does not fit; only binary PLYs can be read in parts, and simplified."""
     from cvtgs.grouping import finer_count
     from cvtgs.outofcore.memory import IMAGE_BYTES, block_count
@@ -370,10 +370,10 @@ def _rows_of(path: Path) -> "PlyRows | None":
 
 def _simplify_blocks(
     options: argparse.Namespace,
-    simplifier: "Simplifier",
+    simplifier: "cvtgs.Simplifier",
     memory: int,
     listener: ProgressListener,
-) -> "SimplifyReport":
+) -> "cvtgs.SimplifyReport":
     """Simplify a file block by block, on this machine or on a cluster."""
     axes = read_axes(options.axes)
     if options.lod:

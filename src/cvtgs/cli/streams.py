@@ -16,10 +16,6 @@ from cvtgs.text import size_text
 
 if TYPE_CHECKING:
     from cvtgs.cli.options import FileAxes
-    from cvtgs.config import SimplifyConfig
-    from cvtgs.progress import ProgressListener
-    from cvtgs.report import Level
-    from cvtgs.streams import StreamLevel
 
 STREAMS = ("sog", "3dtiles")
 OF_STREAMS = ("chunk", "environment", "memory", "workers", "scheduler", "place", "transform")
@@ -132,7 +128,7 @@ def read_transform(options: argparse.Namespace) -> tuple[float, ...] | None:
 def stream_blocks(
     options: argparse.Namespace,
     checkpoint: str | None,
-    config: "SimplifyConfig",
+    config: "cvtgs.SimplifyConfig",
     rhos: Sequence[float],
     axes: "FileAxes",
 ) -> bool:
@@ -203,9 +199,9 @@ def of_different_sizes(rhos: Sequence[float], total: int, valid: int) -> list[fl
 
 def stream_levels(
     options: argparse.Namespace,
-    made: "Sequence[Level]",
+    made: "Sequence[cvtgs.Level]",
     axes: "FileAxes",
-    listener: "ProgressListener",
+    listener: "cvtgs.ProgressListener",
 ) -> None:
     """Write levels that are in memory as a stream, and print its contents."""
     from cvtgs.outofcore.resume import remove_job_files
@@ -222,7 +218,7 @@ def stream_levels(
         chunk_gaussians=options.chunk or CHUNK_GAUSSIANS,
         environment_radii=options.environment,
     )
-    write: Callable[..., tuple[StreamLevel, ...]] = write_sog_stream
+    write: Callable[..., tuple[cvtgs.streams.StreamLevel, ...]] = write_sog_stream
     if options.stream == "3dtiles":
         write = partial(write_tiles, transform=read_transform(options))
     written = write(plan, options.output, overwrite=options.overwrite, listener=listener)
@@ -238,7 +234,7 @@ def stream_levels(
 def _print_levels(
     options: argparse.Namespace,
     chunks: int,
-    levels: "Sequence[StreamLevel]",
+    levels: "Sequence[cvtgs.streams.StreamLevel]",
     more: str = "",
     *,
     errors: Sequence[float] = (),

@@ -2,9 +2,9 @@
 
 import argparse
 import webbrowser
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.display import say
@@ -14,11 +14,6 @@ from cvtgs.cli.paths import any_path, is_same_file, new_file
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import write_atomically
 from cvtgs.text import printable_name
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from cvtgs.scene import GaussianScene
 
 PAGE = "viewer.html"
 HOST, PORT = "127.0.0.1", 8080
@@ -84,7 +79,7 @@ def check_page(options: argparse.Namespace) -> None:
             cvtgs.io.check_output(options.output / PAGE, overwrite=options.overwrite)
 
 
-def write_page(options: argparse.Namespace, scenes: "Mapping[str, GaussianScene]") -> None:
+def write_page(options: argparse.Namespace, scenes: Mapping[str, "cvtgs.GaussianScene"]) -> None:
     """Write the page of ``--viewer`` beside the other files of a command, and print its path."""
     from cvtgs.viewer import scene_page
 
