@@ -4,6 +4,7 @@ import base64
 import math
 import os
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,36 +28,6 @@ MOST_TICKS = 12  # largest number of tick labels that do not overlap
 
 MARK = "*"
 MARK_MEANS = "* no other preset is as good in less time with the same number of Gaussians"
-
-SUMMARY = """\
-<section class="tradeoff">
-<h2>Quality against time</h2>
-{% if chart %}
-<div class="scroller" role="region" tabindex="0" aria-label="Chart"><img class="chart" \
-src="data:image/png;base64,{{ chart }}" alt="PSNR and SSIM over seconds, a line per ratio; the \
-table has the same numbers"></div>
-{% endif %}
-<div class="scroller" role="region" tabindex="0" aria-label="Table"><table id="tradeoff">
-<thead><tr>{% for name in headings %}<th scope="col">{{ name }}</th>{% endfor %}</tr></thead>
-{% for title, rows in groups %}
-<tbody>
-<tr><th class="group" scope="rowgroup" colspan="{{ headings | length }}">{{ title }}</th></tr>
-{% for row in rows %}
-<tr><th scope="row">{{ row[0] }}</th>
-{%- for text in row[1:] %}
-<td{% if text.endswith(mark) %} class="best"{% endif %}>{{ text }}</td>
-{%- endfor %}
-</tr>
-{% endfor %}
-</tbody>
-{% endfor %}
-</table></div>
-<p class="note">{{ mark_means }}. {{ how_measured }}</p>
-{% for failure in failures %}
-<p class="note">{{ failure.name }} failed: {{ failure.reason }}</p>
-{% endfor %}
-</section>
-"""
 
 
 class Written(NamedTuple):
@@ -131,10 +102,7 @@ def write_tradeoff(
 
 
 def tradeoff_chart(tradeoff: Tradeoff) -> bytes:
-    """Plot PSNR and SSIM over seconds, with a line per ratio through the runs on the front.
-
-    A PSNR that is infinite, of equal images, is left out, and the title says so.
-    """
+    """Plot finite PSNR and SSIM over seconds, a line per ratio through the runs on the front."""
     seconds = [result.seconds for result in tradeoff.results]
     endless = sum(math.isinf(result.psnr) for result in tradeoff.results)
     only = f", rho {written(tradeoff.rhos[0])}" if len(tradeoff.rhos) == 1 else ""
@@ -193,8 +161,9 @@ def page_summary(tradeoff: Tradeoff, chart: bytes | None) -> str:
         rows = [cells(tradeoff, result) for result in tradeoff.results if result.rho == rho]
         texts = [[row[name].strip() for name in headings] for row in rows]
         groups.append((heading(tradeoff, rho), texts))
+    template = files("cvtgs.tradeoff") / "summary.html"
     return render_template(
-        SUMMARY,
+        template.read_text(encoding="utf-8"),
         chart=base64.b64encode(chart).decode() if chart else "",
         headings=headings,
         groups=groups,
@@ -210,13 +179,20 @@ def cells(tradeoff: Tradeoff, result: TradeoffResult) -> Mapping[str, str]:
     stages = {f"{name}, s": _seconds(result.stage_seconds.get(name)) for name in tradeoff.stages}
     measured = tradeoff.evaluation.lpips_network is not None
     distance = {"LPIPS": _score(result, "lpips", 4)} if measured else {}
+    photograph = dict[str, str]()
+    for found in tradeoff.evaluation.photographs:
+        if found.name == result.name:
+            photograph["photo PSNR, dB"] = f"{found.psnr.mean:.2f}"
+            photograph["photo SSIM"] = f"{found.ssim.mean:.4f}"
+            if found.lpips is not None:
+                photograph["photo LPIPS"] = f"{found.lpips.mean:.4f}"
     return {
         "preset": result.preset,
         "all, s": _seconds(result.seconds),
         "PSNR, dB": _score(result, "psnr", 2),
         "SSIM": _score(result, "ssim", 4),
         **distance,
-        **_against_photograph(tradeoff, result.name),
+        **photograph,
         "alpha error": "" if result.alpha_error is None else f"{result.alpha_error:.4f}",
         "alpha bias": "" if result.alpha_bias is None else f"{result.alpha_bias:+.4f}",
         "file": size_text(result.bytes),
@@ -235,45 +211,26 @@ def heading(tradeoff: Tradeoff, rho: float) -> str:
 
 def how_measured(tradeoff: Tradeoff) -> str:
     """Return a text on where and how this was measured."""
-    evaluation, against = tradeoff.evaluation, ""
-    for full in evaluation.photographs:
-        if full.name == evaluation.reference:
-            against = (
-                f"The full scene has {full.psnr.mean:.2f} dB and an SSIM of {full.ssim.mean:.4f} "
-                f"against the photographs. "
-            )
-    return (
+    evaluation, source = tradeoff.evaluation, tradeoff.source
+    sentences = [
         f"{counted(evaluation.view_count, 'view')} "
-        f"of {evaluation.width} x {evaluation.height} pixels, rendered by {evaluation.backend}. "
-        f"Every run is a separate process on {tradeoff.machine}. "
-        f"{fitted_to(tradeoff)}{against}{evaluation.lpips_sentence}"
-    ).rstrip()
-
-
-def fitted_to(tradeoff: Tradeoff) -> str:
-    """Return a sentence on the presets that were fitted to cameras of the scene; "" if none was."""
+        f"of {evaluation.width} x {evaluation.height} pixels, rendered by {evaluation.backend}.",
+        f"Every run is a separate process on {tradeoff.machine}.",
+    ]
     results = [one for one in tradeoff.results if one.report.views.endswith("cameras")]
-    if not results:
-        return ""
-    fitted = ", ".join(dict.fromkeys(one.preset for one in results))
-    if tradeoff.held_out:
-        return f"Fitted to the training cameras beside {tradeoff.source}: {fitted}. "
-    return (
-        f"Fitted to cameras beside {tradeoff.source}, which favours them if these score: {fitted}. "
-    )
-
-
-def _against_photograph(tradeoff: Tradeoff, name: str) -> Mapping[str, str]:
-    """Return the columns of scores against photographs, if there are any."""
-    found = next((one for one in tradeoff.evaluation.photographs if one.name == name), None)
-    if found is None:
-        return {}
-    distance = {} if found.lpips is None else {"photo LPIPS": f"{found.lpips.mean:.4f}"}
-    return {
-        "photo PSNR, dB": f"{found.psnr.mean:.2f}",
-        "photo SSIM": f"{found.ssim.mean:.4f}",
-        **distance,
-    }
+    if results:
+        where = f"the training cameras beside {source}"
+        if not tradeoff.held_out:
+            where = f"cameras beside {source}, which favours them if these score"
+        fitted = ", ".join(dict.fromkeys(one.preset for one in results))
+        sentences.append(f"Fitted to {where}: {fitted}.")
+    sentences += [
+        f"The full scene has {full.psnr.mean:.2f} dB and an SSIM of {full.ssim.mean:.4f} "
+        f"against the photographs."
+        for full in evaluation.photographs
+        if full.name == evaluation.reference
+    ]
+    return " ".join(filter(None, [*sentences, evaluation.lpips_sentence]))
 
 
 def _seconds(value: float | None) -> str:

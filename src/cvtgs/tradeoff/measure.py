@@ -36,11 +36,6 @@ from cvtgs.views import automatic_views, find_own_cameras
 STAGE = "simplify"
 RATIOS = (0.1, 0.01, 0.001)
 
-CameraChoice = Callable[[GaussianScene], Cameras]  # function that returns the views of a scene
-
-PhotographChoice = Callable[[Cameras], Float[Tensor, "c h w 3"]]
-"""Function that returns the photograph of every camera, at the size of the cameras."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
@@ -79,20 +74,20 @@ def tasks_of(presets: Sequence[str] | None, rhos: Sequence[float]) -> tuple[Task
     """Check presets and ratios, and list the runs, ratio by ratio."""
     if isinstance(presets, str) or not isinstance(presets, Sequence | None):
         raise InvalidArgumentError(f"presets must be a list of names, found {shown(presets)}.")
-    names = list(PRESETS if presets is None else presets)
-    for name in names:
-        if name not in PRESETS:
-            raise unknown_preset(name)
-    tasks = tuple(Task(preset=name, rho=rho) for rho in written_ratios(rhos) for name in names)
+    tasks: dict[str, Task] = {}  # by name, whose ratios have 15 digits
+    for rho in written_ratios(rhos):
+        for preset in PRESETS if presets is None else presets:
+            if preset not in PRESETS:
+                raise unknown_preset(preset)
+            task = Task(preset=preset, rho=rho)
+            if task.name in tasks:
+                raise InvalidArgumentError(
+                    f"every preset and ratio must be given once, found {task.name} twice."
+                )
+            tasks[task.name] = task
     if not tasks:
         raise InvalidArgumentError("give at least one preset and one ratio.")
-    names_of_tasks = [task.name for task in tasks]  # of 15 digits
-    twice = [name for number, name in enumerate(names_of_tasks) if name in names_of_tasks[:number]]
-    if twice:
-        raise InvalidArgumentError(
-            f"every preset and ratio must be given once, found {twice[0]} twice."
-        )
-    return tasks
+    return tuple(tasks.values())
 
 
 def check_results(source: str | os.PathLike[str], folder: Path, tasks: Sequence[Task]) -> None:
@@ -116,10 +111,9 @@ def run_task(
     device: str = "auto",
     trust_sizes: bool = False,
 ) -> Run:
-    """Run one task by ``cvtgs simplify`` in its own process.
+    """Run ``cvtgs simplify`` in its own process.
 
-    ``training`` has the cameras to whose training split presets that use images are fitted; without
-    it, these presets find their cameras themselves.
+    Presets that use images are fitted to the training split of ``training``, or find cameras.
     """
     path, report = folder / task.file_name, folder / f".{task.file_name}.json"
     words = ["--rho", repr(task.rho), "--preset", task.preset, "--device", device]
@@ -134,13 +128,6 @@ def run_task(
     finally:
         report.unlink(missing_ok=True)
     return Run(task=task, path=path, cost=cost, report=found)
-
-
-def _shared(views: Cameras, training: Path) -> int:
-    """Return how many of some views are of training cameras."""
-    cameras = load_cameras(training, split="train")
-    learned, shown = ({*map(str, one.viewmats.tolist())} for one in (cameras, views))
-    return len(learned & shown)
 
 
 class Measured(NamedTuple):
@@ -160,8 +147,8 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
     *,
     presets: Sequence[str] | None = None,
     rhos: Sequence[float] = RATIOS,
-    cameras: CameraChoice = automatic_views,
-    photographs: PhotographChoice | None = None,
+    cameras: Callable[[GaussianScene], Cameras] = automatic_views,
+    photographs: Callable[[Cameras], Float[Tensor, "c h w 3"]] | None = None,
     settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
     device: str | torch.device = "auto",
     folder: str | os.PathLike[str] | None = None,
@@ -186,7 +173,8 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         presets: Names of presets; None for all, from the fastest to the best.
         rhos: Ratios of Gaussians to keep, each in (0, 1].
         cameras: Returns the views of the scene.
-        photographs: Returns their photographs, to score all scenes against too; None for none.
+        photographs: Returns the photographs of the views, at their size, to score all scenes
+            against too; None for none.
         settings: Background, LPIPS network and backend.
         device: Any torch device, or ``auto``.
         folder: Folder to keep the results in, made if it is missing, as ``fast_0.01.ply``; files
@@ -194,9 +182,6 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         trust_sizes: Whether to believe a compressed source that claims far more Gaussians than its
             bytes can hold.
         listener: Called after each run and image.
-
-    Returns:
-        Costs, scores and images.
 
     Raises:
         CvtgsError: The scene cannot be read, a preset or ratio is invalid, or a result would
@@ -231,7 +216,8 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
     truths = None if photographs is None else photographs(views)
     check_scores(full, views, photographs=truths, settings=settings, name=source_name)
     training = own.source if own is not None and own.test_cameras() is not None else None
-    shared = 0 if training is None else _shared(views, training)
+    learned = load_cameras(training, split="train").viewmats.tolist() if training else []
+    shared = sum(pose in learned for pose in views.viewmats.tolist())
     if shared and any(task.uses_images for task in tasks):
         warn(
             f"presets that use images are fitted to {shared} of the {counted(len(views), 'view')} "

@@ -69,11 +69,7 @@ def pass_warnings_on(errors: str, warned: set[str]) -> None:
 
 
 def run_process(command: Sequence[str]) -> ProcessCost:
-    r"""Run a command to its end and measure it.
-
-    If this call is interrupted, the process is terminated first. Lines of its output end with
-    ``\n``, and Python writes it as UTF-8, on Windows too.
-    """
+    """Run a command to its end, or until this call is interrupted, and measure it."""
     launcher = [sys.executable, "-S", "-c", LAUNCHER, *command]
     reading, writing = os.pipe()
     with os.fdopen(writing, "wb") as held:
@@ -83,6 +79,7 @@ def run_process(command: Sequence[str]) -> ProcessCost:
                 stdin=watched,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
+                # Python writes its output as UTF-8 on Windows too.
                 env={**os.environ, "PYTHONIOENCODING": "utf-8", SAFE_PATH: "1"},
             )
         with process:

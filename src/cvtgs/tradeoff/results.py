@@ -4,6 +4,7 @@ import csv
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from cvtgs.config.base import Record
 from cvtgs.evaluation import Evaluation
@@ -112,23 +113,25 @@ class Tradeoff(Record):
         return tuple(names)
 
     def rest_seconds(self, result: TradeoffResult) -> float:
-        """Return the seconds of a run outside start-up and stages: reading and writing.
-
-        Args:
-            result: One of the results.
-
-        Returns:
-            Seconds, at least 0.
-        """
+        """Return the seconds of a run outside start-up and stages: reading and writing."""
         return max(0.0, result.seconds - self.start_seconds - sum(result.stage_seconds.values()))
 
     def to_csv(self) -> str:
-        """Return one line per run, with seconds per stage; failed runs come last.
+        """Return comma-separated values: a header, and a line per run; failed runs come last.
 
-        Returns:
-            Comma-separated values with a header line; values not measured are empty.
+        Values not measured are empty.
         """
-        rows = [self._row(result) for result in self.results]
+        rows: list[dict[str, Any]] = [
+            {
+                **result.model_dump(exclude={"name", "report"}),
+                "fronts": " ".join(result.fronts),
+                "start_seconds": self.start_seconds,
+                **{f"{name}_seconds": result.stage_seconds.get(name) for name in self.stages},
+                "read_write_seconds": self.rest_seconds(result),
+                "failure": "",
+            }
+            for result in self.results
+        ]
         rows += [
             {"preset": failure.preset, "rho": failure.rho, "failure": failure.reason}
             for failure in self.failures
@@ -139,23 +142,9 @@ class Tradeoff(Record):
         writer.writerows(rows)
         return file.getvalue()
 
-    def _row(self, result: TradeoffResult) -> dict[str, str | int | float | None]:
-        seconds = {f"{name}_seconds": result.stage_seconds.get(name) for name in self.stages}
-        return {
-            **result.model_dump(exclude={"name", "report"}),
-            "fronts": " ".join(result.fronts),
-            "start_seconds": self.start_seconds,
-            **seconds,
-            "read_write_seconds": self.rest_seconds(result),
-            "failure": "",
-        }
-
 
 def on_front(costs: Sequence[float], gains: Sequence[float]) -> tuple[bool, ...]:
-    """Return which of several choices are on the Pareto front: those that no other beats.
-
-    One beats another if it costs no more and gains no less, and is better in one of the two.
-    """
+    """Return which choices no other beats, by costing no more and gaining no less (Pareto)."""
     pairs = list(zip(costs, gains, strict=True))
     return tuple(
         not math.isnan(gain)
