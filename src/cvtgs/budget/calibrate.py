@@ -32,33 +32,19 @@ from cvtgs.synthetic import scene as make
 
 STAGE = "calibrate"
 
-PATIENCE_SECONDS = 1.0
-"""A measurement is repeated, and the fastest counts, until it has taken this long in total."""
-
+PATIENCE_SECONDS = 1.0  # total until which a measurement is repeated; the fastest counts
 MOST_REPEATS = 3
-
-MOST_CPU_SECONDS = 15.0
-"""CPU seconds after which nothing is repeated, and only mandatory trials are measured."""
-
+MOST_CPU_SECONDS = 15.0  # after which nothing is repeated, and only mandatory trials are measured
 LEAST_MEASURED = 3  # number of trials that are measured however long they take
+MOST_START_SECONDS = 1.0  # for loading: what takes longer was compilation, once per installation
 
-MOST_START_SECONDS = 1.0
-"""Cap on loading time: anything beyond it was compilation, which happens once per installation."""
+CANDIDATES = tuple(name for name in PRESETS if name != "paper")  # which is only for comparison
+RENDERERS = ("gsplat", "numba")  # not imported to check, as that can outlast a run
 
-CANDIDATES = tuple(name for name in PRESETS if name != "paper")
-"""Presets to choose from; ``paper`` is only for comparison."""
-
-RENDERERS = ("gsplat", "numba")
-"""Packages that render faster than torch; not imported to check, as that can outlast a run."""
-
-VERSION: Literal[7] = 7
-"""Version of the cache file; raised when features change, so that older files are replaced."""
-
-SHIPPED_RATES = "rates.json"
-"""File beside this module, written by ``python -m benchmarks.cost_model --ship``."""
-
-STALE_SECONDS = 90 * 24 * 3600.0
-"""Age after which a cached model expires, since drivers, limits and other loads change."""
+VERSION: Literal[7] = 7  # of the cache file; raised when features change, to replace older files
+SHIPPED_RATES = "rates.json"  # written by ``python -m benchmarks.cost_model --ship``
+STALE_SECONDS = 90 * 24 * 3600.0  # since drivers, limits and other loads change
+CPU_STEP = 1 / 64  # of a process's CPU seconds on Windows
 
 StageSeconds = Callable[[SimplifyConfig, GaussianScene, int], Mapping[str, float]]
 """Returns the seconds, by stage, of the simplification of a scene to a target count."""
@@ -66,11 +52,7 @@ StageSeconds = Callable[[SimplifyConfig, GaussianScene, int], Mapping[str, float
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """A simplification of a generated scene.
-
-    If the preset uses images, there are ``views`` of ``size`` x ``size`` pixels, and ``steps`` of
-    refinement.
-    """
+    """A simplification of a generated scene, with square images and steps if the preset has any."""
 
     preset: str
     kind: str
@@ -78,7 +60,7 @@ class Trial:
     sh_degree: int
     rho: float
     views: int = 0
-    size: int = 0
+    size: int = 0  # pixels
     steps: int = 0
 
     @property
@@ -100,9 +82,8 @@ class Trial:
         return config.model_copy(update={"visibility": visibility, "refine": refine})
 
 
-CPU_STEP = 1 / 64
-"""Step of a process's CPU seconds on Windows."""
-
+# Small and large scenes, with few and many colour coefficients, and few and many cells. Of fewer
+# than eight images, matching would hold out all instead of every eighth.
 TRIALS = (
     Trial(preset="standard", kind="object", count=20_000, sh_degree=0, rho=0.15),
     Trial(
@@ -116,14 +97,8 @@ TRIALS = (
     ),
     Trial(preset="standard", kind="courtyard", count=60_000, sh_degree=1, rho=0.01),
 )  # fmt: skip
-"""Small and large scenes, with few and many colour coefficients, and few and many cells.
 
-Of fewer than eight images, matching would hold out all instead of every eighth.
-"""
-
-
-_UNSAVED: dict[Path, "CachedModel"] = {}
-"""Measurements of this process that could not be written, by the file they belong in."""
+_UNSAVED: dict[Path, "CachedModel"] = {}  # measurements that could not be written, by their file
 
 
 class CachedModel(Record, allow_inf_nan=False):
@@ -156,9 +131,6 @@ def cost_model(
         calibration: Function that measures; None for the real one, which takes about 10 seconds.
         folder: Cache folder; None for ``cvtgs`` in the user's cache folder.
         listener: Called with progress events.
-
-    Returns:
-        The model.
 
     Raises:
         DeviceError: The device cannot be used.
@@ -193,10 +165,7 @@ def cost_model(
 
 
 def shipped_model() -> CostModel:
-    """Return the cost that comes with the package, without measuring.
-
-    Returns:
-        The model, measured on two cores of a server without a GPU.
+    """Return the cost that comes with the package: of two cores of a server without a GPU.
 
     Example:
         >>> "tessellate" in shipped_model().rates
@@ -271,12 +240,9 @@ def measured_seconds(device: str | torch.device) -> StageSeconds:
 
 
 def undisturbed_seconds(cost: StageCost) -> float:
-    """Return the seconds of a stage without the time that other programs took.
-
-    A stage on the CPU computes all the time and reads no file, so it cannot take longer than its
-    CPU seconds; any time beyond them went to other programs. On Windows, these advance in steps,
-    which shorter stages may not reach.
-    """
+    """Return the seconds of a stage without the time that other programs took."""
+    # A stage on the CPU computes all the time and reads no file, so what it takes beyond its CPU
+    # seconds went to other programs. On Windows, these advance in steps.
     is_short = sys.platform == "win32" and cost.seconds < 4 * CPU_STEP
     if cost.peak_device_memory_bytes or is_short:
         return cost.seconds
@@ -292,14 +258,9 @@ def calibrate(
     cpu: Callable[[], float] = time.process_time,
     listener: ProgressListener = silent,
 ) -> CostModel:
-    """Measure a few simplifications of generated scenes, and fit their cost.
+    """Measure simplifications of generated scenes, and fit their cost.
 
-    The first trial without images, and the first with some, are run once more to load their
-    libraries. Then every trial is measured up to three times, or once if that takes long; the
-    fastest time of each stage counts, since other programs can only slow it down. After 15 CPU
-    seconds nothing is repeated, and the last trials are skipped. Where the measurements leave rates
-    open, those of ``prior`` hold; None is the shipped model. A trial that the prior has measured,
-    too, tells only how much faster or slower this machine is.
+    Rates that the measurements leave open are those of ``prior``; None is the shipped model.
     """
     made = cache(make)
     scenes = [made(trial.kind, trial.count, sh_degree=trial.sh_degree) for trial in trials]
@@ -315,6 +276,7 @@ def calibrate(
         listener(ProgressEvent(stage=STAGE, done=done, total=total, note=note))
         return run(trial.config, scenes[row], work.target)
 
+    # The first trial without images, and the first with some, also run to load their libraries.
     first = {trials[row].config.uses_images: row for row in reversed(range(len(trials)))}
     loading = {row: sum(measure(row, 0, "load preset").values()) for row in sorted(first.values())}
     best: list[dict[str, float]] = [{} for _ in trials]
@@ -326,6 +288,7 @@ def calibrate(
         ):
             begin = clock()
             for stage, seconds in measure(row, number, "preset").items():
+                # Other programs can only slow it down.
                 best[row][stage] = min(seconds, best[row].get(stage, seconds))
             spent[row] += clock() - begin
         listener(ProgressEvent(stage=STAGE, done=number + 1, total=total))
@@ -347,11 +310,9 @@ def calibrate(
 
 
 def _without_misfit(here: Measurement, there: Mapping[str, float], prior: CostModel) -> Measurement:
-    """Replace the seconds of a trial by those that the prior would predict at this speed.
-
-    The prior does not fit each trial exactly, so a trial that takes longer than it predicts may
-    take as long as on the machine of the prior, ``there``: only the ratio of both tells the speed.
-    """
+    """Replace the seconds of a trial by those that the prior would predict at this speed."""
+    # The prior does not fit each trial exactly, so a trial that takes longer than it predicts may
+    # take as long as on the machine of the prior: only the ratio of both tells the speed.
     predicted = prior.stage_seconds(here.work, here.config)
     seconds = {
         stage: predicted[stage] * one / there[stage]

@@ -21,7 +21,7 @@ from cvtgs.text import shown
 CHECK, PLAN = "check", "plan"
 VISIBILITY, NETWORK, MATCH, REFINE = "visibility", "network", "match", "refine"
 
-FEATURES: Mapping[str, tuple[str, ...]] = {
+FEATURES: Mapping[str, tuple[str, ...]] = {  # of each stage; its seconds are linear in them
     "check": ("in", "in_values"),
     "plan": ("once", "in"),
     "filter": ("in",),
@@ -34,15 +34,12 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     REFINE: ("once", "images_in", "looks", "look_pixels", "looks_out"),
     NETWORK: ("once", "in", "sampled", "sampled_values", "out", "out_values"),
 }
-"""Features of each stage; its seconds are linear in their amounts."""
 
 OTHER_FEATURES = ("once", "in", "out")  # features of all other stages
 SHARE_OF_A_STEP = 0.2  # cost of rendering an image without gradients, as a share of a step
 STEPS_OF_A_BATCH = 8.0  # cost of generating one batch of views of any size, in steps
 LEAST_SECONDS = 2e-3  # floor of measured seconds in the relative errors of a fit
 PRIOR_WEIGHT = 0.3  # weight of each prior rate in a fit, in measurements
-
-
 COLORS = tuple(3 * (degree + 1) ** 2 for degree in range(4))
 
 
@@ -77,14 +74,7 @@ class Work:
 
     @classmethod
     def of(cls, scene: GaussianScene, target: int) -> Self:
-        """Return the size of the simplification of a scene.
-
-        Args:
-            scene: The scene.
-            target: Number of Gaussians to keep.
-
-        Returns:
-            The size.
+        """Return the size of the simplification of a scene to a target count.
 
         Example:
             >>> from cvtgs.synthetic import scene as make
@@ -94,15 +84,7 @@ class Work:
         return cls(count=len(scene), target=target, colors=3 * (scene.sh_degree + 1) ** 2)
 
     def features(self, stage: str, config: SimplifyConfig) -> dict[str, float]:
-        """Return the feature amounts of a stage; its seconds are linear in them.
-
-        Args:
-            stage: Name of the stage.
-            config: Configuration of the simplification.
-
-        Returns:
-            Amounts by name.
-        """
+        """Return the feature amounts of a stage by name; its seconds are linear in them."""
         cells = finer_count(self.target, self.count, config.allocation)
         described = min(self.count, MOST_SAMPLED * self.target)
         sample = config.cvt.samples_per_site * cells
@@ -206,17 +188,14 @@ class CostModel(Record, allow_inf_nan=False):
         start: float = 0.0,
         image_start: float = 0.0,
     ) -> Self:
-        """Fit the rates to measurements.
+        """Fit the rates to measurements of different sizes and configurations.
 
         Args:
-            measured: Measurements of simplifications of different sizes and configurations.
+            measured: The measurements.
             prior: Rates of another machine, whose ratios to one another hold where the
                 measurements leave them open; None if there are enough measurements.
-            start: Additional seconds of the first simplification of a process.
-            image_start: The same for libraries that only configurations with images need.
-
-        Returns:
-            The model.
+            start: As of the class.
+            image_start: As of the class.
         """
         rates = {} if prior is None else dict(prior.rates)
         for stage in dict.fromkeys(stage for one in measured for stage in one.seconds):
@@ -229,14 +208,9 @@ class CostModel(Record, allow_inf_nan=False):
         return cls(rates=rates, start=start, image_start=image_start)
 
     def stage_seconds(self, work: Work, config: SimplifyConfig) -> dict[str, float]:
-        """Predict the cost of each stage that a configuration has.
+        """Predict the wall-clock seconds of each stage that a configuration has.
 
-        Args:
-            work: Size of the simplification.
-            config: Configuration of the simplification.
-
-        Returns:
-            Wall-clock seconds by stage; a scene that stays whole is only checked and analysed.
+        A scene that stays whole is only checked and analysed.
         """
         is_whole = work.target >= work.count
         optional = {
@@ -256,15 +230,9 @@ class CostModel(Record, allow_inf_nan=False):
         return seconds
 
     def seconds(self, work: Work, config: SimplifyConfig) -> float:
-        """Predict the cost of a simplification.
+        """Predict the wall-clock seconds of the first simplification of a process.
 
-        Args:
-            work: Size of the simplification.
-            config: Configuration of the simplification.
-
-        Returns:
-            Wall-clock seconds of the first simplification of a process, from the scene in memory
-            to the small scene in memory.
+        They are those from the scene in memory to the small scene in memory.
 
         Example:
             >>> model = CostModel(rates={"check": {"in": 4e-6, "in_values": 0.0}}, start=0.5)
@@ -281,12 +249,9 @@ def fit_rates(
     *,
     prior: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
-    """Fit the rate of each feature to measured seconds.
-
-    This is non-negative least squares (Lawson and Hanson 1974) of relative errors. No rate is
-    negative, so no prediction for more work is below one for less. With a prior, its rates times
-    one factor take part like :data:`PRIOR_WEIGHT` measurements each (ridge regression).
-    """
+    """Fit the rate of each feature to measured seconds; a prior takes part in ridge regression."""
+    # Non-negative least squares (Lawson and Hanson 1974) of relative errors: since no rate is
+    # negative, no prediction for more work is below one for less.
     from scipy.optimize import nnls  # noqa: PLC0415 (heavy, and only for a calibration)
 
     names = list(rows[0])

@@ -26,18 +26,13 @@ from cvtgs.views import automatic_views
 STAGE = "search"
 SCORE = "score"  # the stage of the held-out views, in the report
 
-HELDOUT_SEED = 307
-"""Seed of the views for presets that use images: none of them is of a preset or refinement."""
-
-VIEWS, WIDTH, HEIGHT = 8, 640, 480
-"""Number and size of views, as in ``cvtgs evaluate``: scores depend on the size of images."""
+HELDOUT_SEED = 307  # of views for presets that use images: none is of a preset or refinement
+VIEWS, WIDTH, HEIGHT = 8, 640, 480  # as in ``cvtgs evaluate``: scores depend on the size of images
 
 MOST_SHARE = 0.9  # largest share of Gaussians to try: above it, the full scene is hardly larger
-
 MOST_TRIES = 16
-
 CLOSE = 1.03  # the search ends when a sufficient and an insufficient count are within this factor
-
+MARGIN = 1.3  # predictions are accurate to 30 %, so a preset must fit with this factor
 _FIRST_SHARE, _STEP, _SHORTEST = 0.1, 8.0, 0.15
 
 
@@ -137,9 +132,6 @@ def find_count(
         written: Called with each simplified scene; returns the scene to score, for example as it
             is read back from a file whose format rounds. The result is not rounded.
         listener: Called with progress events.
-
-    Returns:
-        The scene, and all counts that were tried.
 
     Raises:
         GoalError: Even nine tenths of the valid Gaussians do not reach it; the message names the
@@ -246,13 +238,10 @@ def heldout_quality(scorer: Scorer, small: GaussianScene, *, count: int) -> Trie
 def smallest_enough(
     reach: Callable[[int], float], wanted: float, *, most: int
 ) -> Iterator[tuple[int, float]]:
-    """Search for the smallest count whose value reaches a goal; yield each count and its value.
-
-    Values should rise with the count; it takes the fewest tries if they are about linear in its
-    logarithm. The search starts at a tenth of ``most`` and steps by a factor of eight until it has
-    a sufficient and an insufficient count. Then it interpolates on logarithms, but never leaves
-    more than 85 % of the bracket (regula falsi with the guarantee of bisection, as Dekker 1969).
-    """
+    """Search for the smallest count whose value reaches a goal; yield each count and its value."""
+    # It steps by a factor until it has a sufficient and an insufficient count. Then it interpolates
+    # on logarithms, but never leaves more than 85 % of the bracket (regula falsi with the guarantee
+    # of bisection, as Dekker 1969).
     low, low_value = 0, -math.inf
     high, high_value = most + 1, math.inf
     count = max(1, min(most, round(_FIRST_SHARE * most)))
@@ -280,10 +269,6 @@ def smallest_enough(
 
 def _rounded(seconds: float) -> str:
     return f"{seconds:.2g}" if seconds < 10 else f"{seconds:,.0f}"
-
-
-MARGIN = 1.3
-"""Safety factor: predictions are accurate to 30 %, so a preset must fit with this margin."""
 
 
 class Choice(NamedTuple):
@@ -324,9 +309,6 @@ def choose_preset(
         model: The cost of presets; None for :func:`cvtgs.budget.cost_model`, which measures it once
             on this machine.
         with_images: Whether presets that render images may be chosen, which need 400 MB more.
-
-    Returns:
-        The preset, and its predicted seconds.
 
     Raises:
         GoalError: Not even the fastest preset fits; the message says how long it takes.
