@@ -17,8 +17,8 @@ from cvtgs.scene import SceneLike, as_scene
 from cvtgs.validity import any_row, invalid_rows
 
 FAINT = 0.1  # opacities below this are counted as faint: the filter of CVT-GS would drop them
-
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
+HEAVIEST = (0.001, 0.01, 0.1, 0.5)
 
 
 class SceneInfo(Record):
@@ -66,9 +66,6 @@ class SceneInfo(Record):
     __hash__ = None  # type: ignore[assignment]  # compared by value, and has a dictionary
 
 
-HEAVIEST = (0.001, 0.01, 0.1, 0.5)
-
-
 @torch.no_grad()
 @threads_for_chunks()
 @checked
@@ -78,9 +75,6 @@ def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInf
     Args:
         scene: Any scene, or a file or folder of one.
         config: Configuration to plan the effects for; None for the default one.
-
-    Returns:
-        The facts.
 
     Raises:
         InvalidSceneError: The scene has no valid row.

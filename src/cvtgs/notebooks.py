@@ -16,9 +16,7 @@ from cvtgs.text import size_text
 from cvtgs.views import automatic_views
 
 WIDTH, HEIGHT = 320, 240
-
-MOST_DRAWN = 200_000
-"""Only the heaviest Gaussians of larger scenes are drawn, so that a cell takes about a second."""
+MOST_DRAWN = 200_000  # the heaviest of larger scenes, so that a cell takes about a second
 
 
 def scene_html(scene: GaussianScene) -> str:

@@ -11,17 +11,14 @@ import numpy as np
 
 from cvtgs.errors import MissingDependencyError, how_to_install
 
+# Palette of Okabe and Ito 2008, distinct with any colour vision. When the colours are used up, they
+# repeat in the next style; when the styles are used up too, points are marked, in the next shape.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-"""Palette of Okabe and Ito 2008, distinct with any colour vision."""
-
 STYLES = ("-", "--", ":")
-"""Line styles; when the colours are used up, they repeat in the next style."""
-
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<")
-"""Markers; when the styles are used up too, points are marked, in the next shape."""
-
 DPI = 100
 
+# Offsets of a label to the right and up of the point, in typographic points, and its alignments.
 _LABEL_POSITIONS = (
     (0, 7, "center", "bottom"),
     (0, -7, "center", "top"),
@@ -32,25 +29,20 @@ _LABEL_POSITIONS = (
     (-6, 6, "right", "bottom"),
     (-6, -6, "right", "top"),
 )
-"""Label positions: offsets to the right and up of the point, in typographic points; alignments."""
 
 Extents = tuple[float, float, float, float]  # left, lower, right and upper edges in pixels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Series:
-    """One line; it has gaps where ``y`` is not finite.
+    """One line; it has gaps where ``y`` is not finite."""
 
-    Series of the same name share a style in all panels. Labels are texts at the points; hollow
-    points are not part of the line.
-    """
-
-    name: str
+    name: str  # series of one name share a style in all panels
     x: Sequence[float]
     y: Sequence[float]
     markers: bool = False
-    labels: Sequence[str] = ()
-    hollow: Sequence[bool] = ()
+    labels: Sequence[str] = ()  # texts at the points
+    hollow: Sequence[bool] = ()  # points beside the line
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,10 +65,7 @@ def line_chart(
     width: int = 1000,
     height: int = 500,
 ) -> bytes:
-    """Draw panels of lines, row by row and under one legend, as a PNG file.
-
-    The same arguments give the same bytes with the same matplotlib.
-    """
+    """Draw panels of lines, row by row and under one legend, as a PNG file."""
     figure = _figure(width / DPI, height / DPI)
     styles = _styles(panels)
     rows, across = math.ceil(len(panels) / columns), min(columns, len(panels))

@@ -96,10 +96,7 @@ def counted(number: int, word: str) -> str:
 
 
 def short_repr(self: Any) -> str:
-    """Return the ``repr`` of a dataclass, with the dtype and shape of arrays for their values.
-
-    For use as ``__repr__``. A network or another object with a long text is shown by its type.
-    """
+    """Return the ``repr`` of a dataclass with arrays by dtype and shape, long values by type."""
     parts = (f"{name}={_in_short(getattr(self, name))}" for name in self.__dataclass_fields__)
     return f"{type(self).__name__}({', '.join(parts)})"
 

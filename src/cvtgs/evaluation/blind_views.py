@@ -30,9 +30,7 @@ def check_seen(
 ) -> None:
     """Raise if too few cameras see anything of a scene, or one is no pinhole camera.
 
-    A refinement needs two, otherwise one is enough. Warn if few see anything, or if the near plane
-    hides much. A sample of a scene cannot tell that a camera sees nothing, so there is no warning
-    of that.
+    Warn if few see anything, which a sample of a scene cannot tell, or the near plane hides much.
     """
     if len(scene) == 0:
         raise InvalidSceneError(f"{name} must have at least one Gaussian, found none.")
@@ -73,20 +71,12 @@ def check_seen(
 
 
 def shows(scene: GaussianScene, camera: Cameras, alpha: Float[Tensor, "1 h w"]) -> bool:
-    """Return whether an image with this accumulated alpha shows something of a scene.
-
-    Either its mean is not negligible, or the centre of a drawn Gaussian is in the image.
-    """
-    if float(alpha.mean()) >= LEAST_COVER:
-        return True
-    return camera.shows_any(_drawn(scene).double())
+    """Return whether an image has alpha of a scene, or at least the centre of a drawn Gaussian."""
+    return float(alpha.mean()) >= LEAST_COVER or camera.shows_any(_drawn(scene).double())
 
 
 def seeing_rows(scene: GaussianScene, cameras: Cameras) -> Sequence[int]:
-    """Return the rows of cameras with a drawn Gaussian in the image; all if fewer than two.
-
-    An image of nothing would look perfect from the start.
-    """
+    """Return the rows of cameras with a drawn Gaussian in the image; all if fewer than two."""
     points = _drawn(scene).double()
     some = points[:: -(-len(points) // SAMPLED)].cpu()
     found = [

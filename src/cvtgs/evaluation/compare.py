@@ -79,14 +79,7 @@ class Comparison:
         return tuple(self.evaluation.views[view] for view in self.shown)
 
     def ratio(self, scores: SceneScores) -> float:
-        """Return the factor by which a simplified scene has fewer Gaussians.
-
-        Args:
-            scores: The scores of the simplified scene.
-
-        Returns:
-            The factor, for example 100.
-        """
+        """Return the factor by which a simplified scene has fewer Gaussians, for example 100."""
         return self.evaluation.reference_count / max(1, scores.count)
 
 
@@ -115,9 +108,6 @@ def evaluate(
         photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too.
         settings: Background, LPIPS network and backend.
         listener: Called before the first image and after each.
-
-    Returns:
-        The scores, per view and on average.
 
     Raises:
         InvalidArgumentError: There is no camera, none sees anything of the full scene, or images
@@ -170,9 +160,6 @@ def compare(  # noqa: PLR0913 (options by name)
         photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too.
         settings: Background, LPIPS network and backend.
         listener: Called before the first image and after each.
-
-    Returns:
-        The images and the scores.
 
     Raises:
         InvalidArgumentError: As for :func:`evaluate`, ``most_images`` is below 1, or ``sizes``
@@ -262,16 +249,6 @@ def _chosen_cameras(
     return automatic_views(scene)
 
 
-def _check_photographs(photographs: Float[Tensor, "c h w 3"], cameras: Cameras) -> None:
-    shape = f"{len(cameras)} {cameras.height} {cameras.width} 3"
-    check_kinds({"photographs": Float[Tensor, shape]}, {"photographs": photographs})
-    low, high = (float(end) for end in photographs.aminmax())
-    if not -ROUNDING <= low <= high <= 1 + ROUNDING:
-        raise InvalidArgumentError(
-            f"photographs must be in [0, 1], found values from {low:g} to {high:g}."
-        )
-
-
 @torch.no_grad()
 def check_scores(
     scene: GaussianScene,
@@ -301,7 +278,13 @@ def _checked_metrics(
         raise InvalidArgumentError("an evaluation needs at least one camera, found none.")
     check_kinds({"settings": EvaluationSettings}, {"settings": settings})
     if photographs is not None:
-        _check_photographs(photographs, cameras)
+        shape = f"{len(cameras)} {cameras.height} {cameras.width} 3"
+        check_kinds({"photographs": Float[Tensor, shape]}, {"photographs": photographs})
+        low, high = (float(end) for end in photographs.aminmax())
+        if not -ROUNDING <= low <= high <= 1 + ROUNDING:
+            raise InvalidArgumentError(
+                f"photographs must be in [0, 1], found values from {low:g} to {high:g}."
+            )
     metrics = chosen_metrics(settings.lpips, (cameras.width, cameras.height))
     check_seen(reference, cameras, name=name, backend=settings.backend)
     return metrics

@@ -70,9 +70,6 @@ def write_comparison(
         viewer: File name of a page with the scenes in 3D to link to, in the folder; or empty.
         listener: Called before the first file and after each.
 
-    Returns:
-        The paths of the files.
-
     Raises:
         OutputExistsError: A file exists and may not be replaced.
         OutputError: A file cannot be written.
@@ -126,10 +123,7 @@ def contact_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
 
 
 def error_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
-    """Draw error maps of all simplified scenes, with legends of the colours.
-
-    Each simplified scene has a row for colour errors and one for alpha errors.
-    """
+    """Draw a row of colour errors and one of alpha errors for each simplified scene."""
     rows = []
     for scores in comparison.evaluation.scenes:
         colors, alphas = error_maps(comparison, scores.name)
@@ -270,12 +264,7 @@ def comparison_page(
 ) -> str:
     """Return the HTML page, with ``summary`` (made by :func:`render_template`) above the images.
 
-    The cards of the simplified scenes are headed by their names if ``is_named``, else by ratios. It
-    links to the page ``viewer`` with the scenes in 3D, unless that is empty.
-
-    The page has a slider between the full and a simplified scene, selectors of scene and view,
-    counts, bytes and scores, and maps of the colour and alpha errors. The URL fragment
-    ``#view=2&small=1&split=30&error=1`` sets the initial state; ``error=2`` shows alpha errors.
+    Cards of scenes are headed by ratios unless ``is_named``; ``viewer`` is a page to link to.
     """
     parts = files("cvtgs.evaluation") / "page_parts"
     texts = {

@@ -70,7 +70,6 @@ def _css_gradient(colors: tuple[tuple[int, int, int], ...]) -> str:
 
 
 CSS_GRADIENT, CSS_ALPHA_GRADIENT = _css_gradient(_MAGMA), _css_gradient(_ALPHA)
-"""CSS gradients of the colour maps, from left to right."""
 
 
 def as_bytes(values: Float[Tensor, "h w *c"]) -> UInt8[np.ndarray, "h w *c"]:
@@ -302,10 +301,7 @@ def _find_all(place: Path, cameras: Cameras) -> list[Path]:
 
 
 def _find(folder: Path, name: str) -> Path | None:
-    """Look for the whole name, then for fewer of its last parts; each as it is, then by suffix.
-
-    A suffix of the same format comes first. If there are several others, one may be a mask.
-    """
+    """Look for the whole name, then for fewer of its last parts; each as it is, then by suffix."""
     whole = PurePosixPath(name.replace("\\", "/"))
     parts = [part for part in whole.parts if part not in ("/", ".", "..")]
     for first in range(len(parts)):
@@ -321,7 +317,7 @@ def _find(folder: Path, name: str) -> Path | None:
                 candidate = base.with_name(base.name + written)
                 if candidate.is_file():
                     found.setdefault(_format_of(suffix), candidate)
-        if len(found) > 1 and own not in found:
+        if len(found) > 1 and own not in found:  # one may be a mask
             names = " and ".join(path.name for path in found.values())
             raise InvalidArgumentError(
                 f"{folder}: must hold one photograph of camera {shown(name)}, found {names}."

@@ -25,8 +25,7 @@ from cvtgs.io.files import is_folder, open_input
 from cvtgs.losses import check_pair
 from cvtgs.text import short_repr
 
-LPIPS_VARIABLE = "CVTGS_LPIPS_WEIGHTS"
-"""Environment variable with the path of a weights file, or of a folder of weights files."""
+LPIPS_VARIABLE = "CVTGS_LPIPS_WEIGHTS"  # path of a weights file, or of a folder of them
 
 LpipsNetwork = Literal["alex", "vgg"]
 """AlexNet (Krizhevsky 2014) or VGG16 (Simonyan and Zisserman 2014)."""
@@ -214,9 +213,6 @@ def load_lpips(
     Args:
         network: ``"vgg"`` or ``"alex"``.
         path: A weights file or a folder of weights files.
-
-    Returns:
-        The weights.
 
     Raises:
         InvalidArgumentError: There is no such network.

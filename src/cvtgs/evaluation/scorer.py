@@ -44,16 +44,7 @@ class Score(Record):
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Self:
-        """Make a score from the values of the views.
-
-        Args:
-            values: One per view, at least one.
-
-        Returns:
-            The score.
-
-        Raises:
-            InvalidArgumentError: There is no value.
+        """Make a score from the values of the views; InvalidArgumentError if there is none.
 
         Example:
             >>> Score.of([20.0, 30.0]).mean
@@ -88,11 +79,7 @@ class SceneScores(Record):
     alpha_bias: Score | None = None
 
     def means(self) -> dict[str, Any]:
-        """Return the mean over the views of every score.
-
-        Returns:
-            Means by name; None for what was not measured.
-        """
+        """Return the mean over the views of every score by name; None if it was not measured."""
         scores = {name: value for name, value in self if name not in ("name", "count")}
         return {name: None if score is None else score.mean for name, score in scores.items()}
 
@@ -308,10 +295,7 @@ def chosen_metrics(choice: LpipsChoice, size: tuple[int, int]) -> Metrics:
 def scene_scores(
     name: str, count: int, rows: Sequence[ImageScores], *, blind: Sequence[int] = ()
 ) -> SceneScores:
-    """Average the scores of a scene, one row per view; all rows must have SSIM.
-
-    Blind views, by their number, do not count in means, unless all are.
-    """
+    """Average the scores of a scene, one row per view, without blind views unless all are."""
     psnrs, ssims, distances, errors, biases = zip(*rows, strict=True)
     has_alpha = not any(map(math.isnan, errors))
     counted = [view for view in range(len(rows)) if view not in blind] or range(len(rows))
