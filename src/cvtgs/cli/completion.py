@@ -5,6 +5,7 @@ import io
 import sys
 from collections.abc import Iterator, Mapping
 from functools import partial
+from importlib.resources import files
 
 import cvtgs
 from cvtgs.cli.display import say
@@ -14,38 +15,6 @@ SHELLS = ("bash", "zsh", "fish")
 
 _ZSH = """(( $+functions[compdef] )) || { autoload -U compinit && compinit }
 autoload -U +X bashcompinit && bashcompinit
-"""
-
-_BASH = """\
-_cvtgs() {{
-    local current="${{COMP_WORDS[COMP_CWORD]}}" before="${{COMP_WORDS[COMP_CWORD-1]}}"
-    local command="${{COMP_WORDS[1]}}" words=""
-    if [ "$COMP_CWORD" -eq 1 ]; then
-        COMPREPLY=($(compgen -W "{commands}" -- "$current"))
-        return
-    fi
-    if [ "$current" = "=" ]; then  # bash splits --option=value into three words
-        current=""
-    elif [ "$before" = "=" ]; then
-        before="${{COMP_WORDS[COMP_CWORD-2]}}"
-    fi
-    case "$command $before" in
-{values}
-    esac
-    if [ -z "$words" ] && [[ "$current" == -* ]]; then
-        case "$command" in
-{options}
-        esac
-    fi
-    if [ -n "$words" ]; then
-        COMPREPLY=($(compgen -W "$words" -- "$current"))
-    fi
-    if [ -z "$words" ] || [ "$before" = --ckpt ]; then
-        local IFS=$'\n'  # names may hold spaces
-        COMPREPLY+=($(compgen -f -- "$current"))
-    fi
-}}
-complete -o filenames -F _cvtgs cvtgs
 """
 
 
@@ -91,16 +60,16 @@ def bash_script(commands: Mapping[str, argparse.ArgumentParser]) -> str:
     """Return the script for bash."""
     values, options = [], []
     for command, parser in commands.items():
-        names = [name for action in parser._actions for name in action.option_strings]
-        options.append(f'            {command}) words="{" ".join(names)}" ;;')
+        names = list[str]()
         for action in parser._actions:
-            words = " ".join(values_of(action))
-            if words:
+            names += action.option_strings
+            if words := " ".join(values_of(action)):
                 cases = [f'"{command} {name}"' for name in action.option_strings or [command]]
                 values.append(f'        {"|".join(cases)}) words="{words}" ;;')
-    return _BASH.format(
-        commands=" ".join(commands), values="\n".join(values), options="\n".join(options)
-    )
+        options.append(f'            {command}) words="{" ".join(names)}" ;;')
+    script = (files("cvtgs.cli") / "completion.bash").read_text(encoding="utf-8")
+    script = script.replace("@commands@", " ".join(commands))
+    return script.replace("@values@", "\n".join(values)).replace("@options@", "\n".join(options))
 
 
 def fish_lines(commands: Mapping[str, argparse.ArgumentParser]) -> Iterator[str]:
@@ -111,20 +80,15 @@ def fish_lines(commands: Mapping[str, argparse.ArgumentParser]) -> Iterator[str]
         for action in parser._actions:
             names = [name for name in action.option_strings if name.startswith("--")]
             words = " ".join(values_of(action))
-            if not names:
-                if words:
-                    where = f"-n '__fish_seen_subcommand_from {command}'"
-                    yield f"complete -c cvtgs {where} -x -a {_quoted(words)}"
-                continue
+            line = f"complete -c cvtgs -n '__fish_seen_subcommand_from {command}'"
             alone = "-r" if action.dest == "ckpt" else "-x"  # -r also completes files
             takes = f" {alone} -a {_quoted(words)}" if words else " -r" * (action.nargs != 0)
-            about = (action.help or "").replace("%%", "%").split(";")[0]
-            yield (
-                f"complete -c cvtgs -n '__fish_seen_subcommand_from {command}' -l {names[0][2:]}"
-                f"{takes} -d {_quoted(about)}"
-            )
+            if names:
+                about = (action.help or "").replace("%%", "%").split(";")[0]
+                yield f"{line} -l {names[0][2:]}{takes} -d {_quoted(about)}"
+            elif words:
+                yield f"{line}{takes}"
 
 
 def _quoted(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{escaped}'"
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
