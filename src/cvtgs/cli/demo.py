@@ -13,11 +13,14 @@ from cvtgs.cli.paths import new_folder
 from cvtgs.errors import OutputExistsError
 from cvtgs.text import size_text
 
-RATIOS = (0.1, 0.01)
+FULL, SMALL = "full.ply", {"small_0.1.ply": 0.1, "small_0.01.ply": 0.01}  # ratios
 VIEWS, WIDTH, HEIGHT = 6, 480, 360
+OWN_SCENE = """With a scene of your own:
+  cvtgs info scene.ply
+  cvtgs simplify scene.ply small.ply --rho 0.01
+  cvtgs compare scene.ply small.ply -o comparison"""
 
 _MADE_BY = "written by cvtgs demo"
-_HEADER = 4096
 
 
 def add_demo(add_parser: AddParser) -> None:
@@ -58,27 +61,36 @@ def demo(options: argparse.Namespace) -> None:
 
     make_folder(options.output)
     _check_folder(options.output)
+    columns, sizes, smaller = list[dict[str, str]](), dict[str, int](), {}
+
+    def write(
+        scene: "cvtgs.GaussianScene", name: str, stages: "Sequence[cvtgs.clock.StageCost]" = ()
+    ) -> None:
+        path = options.output / name
+        cvtgs.save(scene, path, overwrite=True)
+        sizes[name] = path.stat().st_size
+        columns.append(
+            {"file": name, "Gaussians": f"{len(scene):,}", "size": size_text(sizes[name])}
+        )
+        columns[-1] |= {f"{cost.stage}, s": f"{cost.seconds:.2f}" for cost in stages}
+        if stages:
+            columns[-1]["all stages, s"] = f"{sum(cost.seconds for cost in stages):.2f}"
+
     with progress_bars(quiet=options.quiet) as listener:
         simplifier = cvtgs.Simplifier(
             config=options.preset or "standard", device=options.device, listener=listener
         )
         scene = cvtgs.synthetic.demo_scene(options.count, seed=options.seed)
         scene = replace(scene, comments=(*scene.comments, _MADE_BY))
-        path = options.output / "full.ply"
-        cvtgs.save(scene, path, overwrite=True)
-        columns = [_column(path, len(scene), ())]
-        sizes, smaller = {path.name: path.stat().st_size}, {}
-        for rho in RATIOS:
-            small, report = simplifier.run(scene, rho)
-            path = options.output / f"small_{rho:g}.ply"
-            cvtgs.save(small, path, overwrite=True)
-            columns.append(_column(path, len(small), report.stages))
-            sizes[path.name], smaller[path.name] = path.stat().st_size, small
+        write(scene, FULL)
+        for name, rho in SMALL.items():
+            smaller[name], report = simplifier.run(scene, rho)
+            write(smaller[name], name, report.stages)
         comparison = cvtgs.evaluation.compare(
             scene,
             smaller,
             cvtgs.views.automatic_views(scene, VIEWS, width=WIDTH, height=HEIGHT),
-            reference_name="full.ply",
+            reference_name=FULL,
             sizes=sizes,
             settings=cvtgs.evaluation.EvaluationSettings(lpips="off"),
             listener=listener,
@@ -94,39 +106,22 @@ def demo(options: argparse.Namespace) -> None:
                 column["alpha error"] = f"{scores.alpha_error.mean:.4f}"
         names = columns[-1]  # the full scene lacks some
         say_table([[name, *(column.get(name, "") for column in columns)] for name in names])
-        _print_next_steps(options.output)
+        say("Compare them side by side: open this page in a browser (it works offline).")
+        say(f"  {(options.output / 'index.html').resolve().as_uri()}")
+        say_wrapped(f"The scenes are in {options.output}; any 3DGS viewer opens them.")
+        say(OWN_SCENE)
 
 
 def _check_folder(folder: Path) -> None:
     """Raise if a folder holds other files than those of an earlier demo."""
     from cvtgs.evaluation.comparison_files import ERRORS, PAGE, SHEET
 
-    full = folder / "full.ply"
     start = b""
-    with suppress(OSError), full.open("rb") as file:
-        start = file.read(_HEADER)
-    names = ["full.ply", PAGE, SHEET, ERRORS, *(f"small_{rho:g}.ply" for rho in RATIOS)]
+    with suppress(OSError), (folder / FULL).open("rb") as file:
+        start = file.read(4096)  # the header
+    names = (FULL, PAGE, SHEET, ERRORS, *SMALL)
     found = next((name for name in names if (folder / name).exists()), None)
     if found is not None and f"comment {_MADE_BY}\n".encode() not in start:
         raise OutputExistsError(
             f"{folder}: must be a new folder or that of an earlier demo, found {found}."
         )
-
-
-def _column(path: Path, count: int, stages: "Sequence[cvtgs.clock.StageCost]") -> dict[str, str]:
-    size = size_text(path.stat().st_size)
-    column = {"file": path.name, "Gaussians": f"{count:,}", "size": size}
-    column |= {f"{cost.stage}, s": f"{cost.seconds:.2f}" for cost in stages}
-    if stages:
-        column["all stages, s"] = f"{sum(cost.seconds for cost in stages):.2f}"
-    return column
-
-
-def _print_next_steps(folder: Path) -> None:
-    say("Compare them side by side: open this page in a browser (it works offline).")
-    say(f"  {(folder / 'index.html').resolve().as_uri()}")
-    say_wrapped(f"The scenes are in {folder}; any 3DGS viewer opens them.")
-    say("With a scene of your own:")
-    say("  cvtgs info scene.ply")
-    say("  cvtgs simplify scene.ply small.ply --rho 0.01")
-    say("  cvtgs compare scene.ply small.ply -o comparison")

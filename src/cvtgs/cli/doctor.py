@@ -16,23 +16,16 @@ if TYPE_CHECKING:
 
     from cvtgs.rendering import BackendName
 
-BACKENDS = ("torch", "numpy", "scipy", "numba", "gsplat")
-"""The packages that cvtgs computes with; the last two are optional."""
-
+BACKENDS = ("torch", "numpy", "scipy", "numba", "gsplat")  # packages; the last two are optional
 RENDERERS = ("torch", "numba", "gsplat")
-SEARCHES = {
-    "scipy": "scipy (a k-d tree on the host)",
-    "tiles": "tiles (dense distances on the device)",
-}
-"""What each search for the nearest sites is."""
+SEARCHES = {"scipy": "a k-d tree on the host", "tiles": "dense distances on the device"}
 
 WITHOUT_OPENMP = (
     "numba finds no OpenMP, so it renders one image at a time. With the system's package "
     "(libgomp1 on Debian and Ubuntu), presets that render are faster."
 )
 
-COUNT, RHO, SIDE = 20_000, 0.1, 256
-"""The small run: Gaussians, ratio, and side of the square image in pixels."""
+COUNT, RHO, SIDE = 20_000, 0.1, 256  # the small run: Gaussians, ratio, side of the image (pixels)
 
 
 class ShowVersions(argparse.Action):
@@ -87,9 +80,15 @@ def doctor(options: argparse.Namespace) -> None:
         for name in RENDERERS:
             use = " (used: the fastest that works here)" if name == taken else ""
             say(f"  images by {name:<7} {_renderer_state(name, one)}{use}")
-        say(f"  nearest sites by {SEARCHES[search_name(one)]}")
+        search = search_name(one)
+        say(f"  nearest sites by {search} ({SEARCHES[search]})")
     if options.device == "auto" and not gpus:
-        say(f"\ncuda: not available: {_reason_without_gpu()}")
+        reason = f"torch {torch.__version__} is built for CPUs only"
+        if built_for := torch.version.cuda or torch.version.hip:
+            reason = (
+                f"torch {torch.__version__} finds no GPU, or no driver for {built_for} or later"
+            )
+        say(f"\ncuda: not available: {reason}")
     say(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one image")
     try:
         for line in _small_run(default):
@@ -105,16 +104,6 @@ def doctor(options: argparse.Namespace) -> None:
 
         if not takes_several_loops():
             say(WITHOUT_OPENMP)
-
-
-def _reason_without_gpu() -> str:
-    """Return why torch finds no GPU."""
-    import torch
-
-    built_for = torch.version.cuda or torch.version.hip
-    if built_for is None:
-        return f"torch {torch.__version__} is built for CPUs only"
-    return f"torch {torch.__version__} finds no GPU, or no driver for {built_for} or later"
 
 
 def _renderer_state(name: str, device: "torch.device") -> str:

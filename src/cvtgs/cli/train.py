@@ -2,17 +2,12 @@
 
 import argparse
 import math
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.display import progress_bars, say
 from cvtgs.cli.options import AddParser, add_options
 from cvtgs.cli.paths import any_path
 from cvtgs.errors import how_to_install, warn
-
-if TYPE_CHECKING:
-    from cvtgs.train import History, TrainConfig
 
 WITHOUT_CURVES = f"no image of its curves, which needs matplotlib; {how_to_install('cvtgs[plots]')}"
 
@@ -72,18 +67,23 @@ def train(options: argparse.Namespace) -> None:
     from cvtgs.devices import chosen_device
 
     config = cvtgs.train.TrainConfig.from_toml(options.config)
-    config = _with_scenes(config, options.scenes, options.validation)
+    data = config.data.model_copy(
+        update={
+            "folders": (*config.data.folders, *options.scenes),
+            "validation": tuple(options.validation) or config.data.validation,
+        }
+    )
+    config = config.model_copy(update={"data": data})
     files = cvtgs.train.TrainFiles.beside(options.output, options.cache)
     if options.resume and not files.state.is_file():
         warn(f"{files.state}: there is no such state, so the training starts from the beginning.")
-    device = chosen_device(options.device)
     with progress_bars(quiet=options.quiet) as listener:
         history = cvtgs.train.train(
             config,
             files,
             resume=options.resume,
             overwrite=options.overwrite,
-            device=device,
+            device=chosen_device(options.device),
             listener=listener,
             on_validation=lambda history: None if options.quiet else print_validation(history),
         )
@@ -94,18 +94,7 @@ def train(options: argparse.Namespace) -> None:
         say(f"{files.checkpoint}, {curves}")
 
 
-def _with_scenes(
-    config: "TrainConfig", folders: list[Path], validation: list[str]
-) -> "TrainConfig":
-    changes = {
-        "folders": (*config.data.folders, *folders),
-        "validation": tuple(validation) or config.data.validation,
-    }
-    data = config.data.model_copy(update=changes)
-    return config.model_copy(update={"data": data})
-
-
-def print_validation(history: "History") -> None:
+def print_validation(history: "cvtgs.train.History") -> None:
     """Print one line about the last validation."""
     last = history.validations[-1]
     gains = ", ".join(
