@@ -126,10 +126,9 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
     to_stream = target == STREAM
     with ExitStack() as stack:
         if to_stream:
-            if sys.stdout is None:
-                raise OutputError("standard output must be a pipe or a file, found none.")
-            if sys.stdout.isatty():
-                raise OutputError("standard output must be a pipe or a file, found a terminal.")
+            if sys.stdout is None or sys.stdout.isatty():
+                found = "none" if sys.stdout is None else "a terminal"
+                raise OutputError(f"standard output must be a pipe or a file, found {found}.")
             folder = stack.enter_context(TemporaryDirectory(prefix="cvtgs-"))
             target = f"{folder}/standard-output{options.suffix or '.ply'}"
             stack.enter_context(named_in_warnings(Path(target), STANDARD_OUTPUT))
@@ -155,10 +154,9 @@ def input_file(source: str | Path) -> Iterator[Path]:
         return
     from cvtgs.io.streams import file_of
 
-    if sys.stdin is None:
-        raise InputError("standard input must be a pipe or a file, found none.")
-    if sys.stdin.isatty():
-        raise InputError("standard input must be a pipe or a file, found a terminal.")
+    if sys.stdin is None or sys.stdin.isatty():
+        found = "none" if sys.stdin is None else "a terminal"
+        raise InputError(f"standard input must be a pipe or a file, found {found}.")
     with file_of(sys.stdin.buffer, name=STANDARD_INPUT, advice=_OTHER_FORMATS) as path:
         yield path
 
@@ -179,10 +177,7 @@ def run_jobs(
     work: Callable[[SceneJob], Outcome],
     failed: Callable[[SceneJob, CvtgsError], None] = lambda job, error: None,
 ) -> None:
-    """Call ``work`` for every scene, and print the results and their paths.
-
-    Of many scenes, one that fails is passed to ``failed``, and the others follow.
-    """
+    """Call ``work`` for every scene and print the results; go on if one of many has ``failed``."""
     first = jobs[0]
     if not first.is_one_of_many:
         _run_one(first, work)
@@ -197,11 +192,11 @@ def run_jobs(
             bytes_in = cvtgs.io.scene_size(source)
             outcome = work(job)
         except CvtgsError as error:
-            failures += 1
             failed(job, error)
             name = "" if str(error).startswith(str(source)) else f"{source}: "
             say(printable_name(f"cvtgs: error: {place}{name}{error}"), file=sys.stderr)
         if outcome is None:
+            failures += 1
             gc.collect()  # the error and its frames refer to each other, and hold the scene
             continue
         bytes_out = _size_of_output(target)
@@ -254,29 +249,27 @@ def _size_of_output(path: Path) -> int | None:
 def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
     """Return a job for every input; raise if two would write the same file."""
     sources = expanded(options.paths)
-    targets: dict[Path, Path] = {}
+    ignores_case = sys.platform in ("darwin", "win32")
     named: dict[str, Path] = {}
+    jobs = []
     for source in sources:
         name = _output_name(source, options.suffix)
-        ignores_case = sys.platform in ("darwin", "win32")
         before = named.setdefault(name.lower() if ignores_case else name, source)
-        if before is not source and before == source:
-            raise InvalidArgumentError(f"every scene must be given once, found {source} twice.")
         if before is not source:
             raise InvalidArgumentError(
                 f"two scenes must not have the same name in {options.folder}, found "
                 f"{before} and {source}."
             )
-        targets[options.folder / name] = source
-    jobs = []
-    for target, source in targets.items():
+        own = {"input": source, "output": options.folder / name}
+        job = argparse.Namespace(**{**vars(options), **own})
+        jobs.append(SceneJob(options=job, is_one_of_many=True))
+    for one in jobs:
+        source, target = one.options.input, one.options.output
         for other in [*sources, *getattr(options, "merge", ())]:
             if other != source and is_same_file(target, other):
                 raise InvalidArgumentError(
                     f"the output of {source} must not replace another input, found {target}."
                 )
-        own = argparse.Namespace(**{**vars(options), "input": source, "output": target})
-        jobs.append(SceneJob(options=own, is_one_of_many=True))
     make_output_folder(options)
     return jobs
 
@@ -291,21 +284,15 @@ def make_output_folder(options: argparse.Namespace) -> None:
 
 def expanded(patterns: Iterable[str | Path]) -> list[Path]:
     """Expand folders of scenes, and patterns that the shell left unexpanded as on Windows."""
-    return [
-        Path(path)
-        for pattern in patterns
-        for found in _matches(str(pattern))
-        for path in _in_folder(found)
-    ]
-
-
-def _matches(pattern: str) -> list[str]:
-    if os.path.lexists(pattern) or not glob.has_magic(pattern):
-        return [pattern]
-    found = sorted(glob.glob(pattern, recursive=True))  # noqa: PTH207 (any path, any pattern)
-    if not found:
-        raise InputNotFoundError(f"{pattern}: the pattern must match a file, found none.")
-    return found
+    paths = []
+    for pattern in map(str, patterns):
+        found = [pattern]
+        if glob.has_magic(pattern) and not os.path.lexists(pattern):
+            found = sorted(glob.glob(pattern, recursive=True))  # noqa: PTH207 (any pattern)
+        if not found:
+            raise InputNotFoundError(f"{pattern}: the pattern must match a file, found none.")
+        paths += [Path(path) for one in found for path in _in_folder(one)]
+    return paths
 
 
 def _in_folder(folder: str) -> list[str]:
