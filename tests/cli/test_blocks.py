@@ -6,9 +6,8 @@ from pathlib import Path
 import pytest
 
 import cvtgs
-from cvtgs.cli.blocks import block_workers
+from cvtgs.cli.blocks import block_memory, block_workers
 from cvtgs.cli.main import main
-from cvtgs.cli.simplify import block_memory
 from cvtgs.errors import OutputBusyError, OutputError, RunError
 from cvtgs.io.ply import PlyRows
 from cvtgs.outofcore.memory import IMAGE_BYTES, LEAST_BYTES, WORKER_BYTES

@@ -158,11 +158,8 @@ def test_a_time_budget_chooses_a_preset_and_explains_it(scene):
     chosen = choose_preset(options("--rho", "0.1", "--time-budget", "8s"), scene, {}, silent)
     assert chosen.name == "high"
     assert chosen.reason.startswith("Preset high, the best that fits into 8 s: expected to take 4")
-    assert chosen.late_note(8.0) == []
-    assert chosen.late_note(44.0) == [
-        "Simplifying and writing took 44.0 s, where 8.0 s were left; --recalibrate measures this "
-        "machine again."
-    ]
+    assert chosen.left == 8.0
+    assert chosen.advice == "--recalibrate measures this machine again"
 
 
 @pytest.mark.parametrize(

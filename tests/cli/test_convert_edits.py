@@ -81,7 +81,7 @@ def test_edits_use_the_axes_of_a_ply(tmp_path: Path, scene: GaussianScene) -> No
     [
         (
             ["--crop-box", "1,2,3"],
-            "--crop-box must be six numbers x,y,z,X,Y,Z, the minimum and max",
+            "--crop-box must be 6 numbers x,y,z,X,Y,Z, the minimum and max",
         ),
         (
             ["--crop-box", "1,0,0,0,1,1"],
@@ -96,10 +96,10 @@ def test_edits_use_the_axes_of_a_ply(tmp_path: Path, scene: GaussianScene) -> No
             ["--scale", "1e-60"],
             "a motion must not shrink all coordinates below 1.18e-38, the",
         ),
-        (["--rotate", "90"], "--rotate must be three numbers x,y,z, degrees about each axis, fou"),
-        (["--rotate", ""], "--rotate must be three numbers x,y,z, degrees about each axis, found"),
-        (["--translate", ""], "--translate must be three numbers x,y,z, found ''"),
-        (["--translate", "nan,0,0"], "--translate must be three numbers x,y,z, found 'nan,0,0'"),
+        (["--rotate", "90"], "--rotate must be 3 numbers x,y,z, degrees about each axis, fou"),
+        (["--rotate", ""], "--rotate must be 3 numbers x,y,z, degrees about each axis, found"),
+        (["--translate", ""], "--translate must be 3 numbers x,y,z, found ''"),
+        (["--translate", "nan,0,0"], "--translate must be 3 numbers x,y,z, found 'nan,0,0'"),
         (["--merge", "-"], "--merge takes files; only IN may be - for standard input."),
         (["--merge", "missing.ply"], "missing.ply: the file to read must exist, found none."),
         (

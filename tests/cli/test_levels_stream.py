@@ -63,7 +63,7 @@ def test_an_environment_is_mentioned_only_if_there_is_one(
         (["--stream", "sog", "--environment", "inf"], "--environment must be above 0"),
         (["--memory", "2GB"], "--memory needs --stream."),
         (["--transform", "1"], "--transform needs --stream 3dtiles."),
-        (["--stream", "sog", "--place", "8,47"], "--place and --transform need --stream 3dtiles."),
+        (["--stream", "sog", "--place", "8,47"], "--place needs --stream 3dtiles, found sog."),
         (
             ["--stream", "3dtiles", "--place", "8"],
             "--place must be 2 or 3 numbers separated by commas",

@@ -73,8 +73,8 @@ def test_a_failed_run_is_reported_and_the_others_continue(source, tmp_path, caps
     ("words", "text"),
     [
         (["--presets", "best"], "preset must be one of "),
-        (["--views", "0"], "--views must be at least 1, found 0."),
-        (["--views", "10001"], "--views must be at most 10,000, found 10,001."),
+        (["--views", "0"], "--views must be from 1 to 10,000, found 0."),
+        (["--views", "10001"], "--views must be from 1 to 10,000, found 10,001."),
     ],
 )
 def test_invalid_arguments_are_refused_in_one_sentence(source, tmp_path, capsys, words, text):

@@ -1,13 +1,32 @@
-"""Options of commands that work block by block, and the workers that they choose."""
+"""Work block by block: its options, when it is needed, its workers, and ``cvtgs simplify``."""
 
 import argparse
 import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+import cvtgs
+from cvtgs.cli.cameras import read_cameras
 from cvtgs.cli.display import say
-from cvtgs.errors import InvalidArgumentError, OutputBusyError, OutputError, RunError, warn
+from cvtgs.cli.goals import has_target
+from cvtgs.cli.options import checkpoint_of
+from cvtgs.errors import (
+    ConfigError,
+    FileFormatError,
+    InputError,
+    InvalidArgumentError,
+    OutputBusyError,
+    OutputError,
+    RunError,
+    warn,
+)
+from cvtgs.progress import ProgressListener
 from cvtgs.text import size_text
+
+if TYPE_CHECKING:
+    from cvtgs.io.ply import PlyRows
 
 
 def add_block_options(parser: argparse.ArgumentParser) -> None:
@@ -60,10 +79,7 @@ def check_block_device(options: argparse.Namespace) -> None:
 def block_workers(
     options: argparse.Namespace, memory: int
 ) -> Iterator[tuple["cvtgs.outofcore.Workers | None", int]]:
-    """Return workers, None for this process alone, and the bytes that each may use.
-
-    After an interrupt or a failure, print where the finished steps are.
-    """
+    """Return workers, None for this process alone, and the bytes of each; clean up on failure."""
     from cvtgs.io.locks import hidden_path
     from cvtgs.outofcore import ClusterWorkers, LocalWorkers, connect
     from cvtgs.outofcore.memory import WORKER_BYTES, worker_count
@@ -98,3 +114,89 @@ def block_workers(
             is_stream = getattr(options, "stream", None) is not None
             remove_job_files(options.output, is_stream=is_stream)  # processes wrote until they end
         raise
+
+
+def block_memory(options: argparse.Namespace, config: "cvtgs.SimplifyConfig") -> int | None:
+    """Return the bytes for simplifying in blocks; None if blocks are not needed or not possible."""
+    from cvtgs.outofcore.run import check_config
+
+    memory = memory_of(options)
+    if options.scheduler is None and not needs_blocks(options, memory, config):
+        return None
+    try:
+        for name in ("target_psnr", "target_ssim", "time_budget"):
+            if getattr(options, name) is not None:
+                images = "" if name == "time_budget" else " and 400 MB for images of it"
+                raise InvalidArgumentError(
+                    f"--{name.replace('_', '-')} cannot be used with blocks: it needs memory for "
+                    f"the whole scene{images} at once."
+                )
+        check_block_device(options)
+        check_config(config)
+    except (ConfigError, InvalidArgumentError):
+        if options.memory is not None or options.scheduler is not None:
+            raise
+        return None
+    return memory
+
+
+def needs_blocks(options: argparse.Namespace, memory: int, config: "cvtgs.SimplifyConfig") -> bool:
+    """Return whether a file does not fit; only binary PLYs can be read in parts, and simplified."""
+    from cvtgs.grouping import finer_count
+    from cvtgs.outofcore.memory import IMAGE_BYTES, block_count
+
+    rows = rows_of(options.input)
+    if rows is None:
+        return False
+    target = rows.count
+    if not has_target(options):
+        target = cvtgs.target_count(
+            rows.count, options.rho, count=options.count, max_count=options.max_count
+        )
+        if target == rows.count:
+            return False
+    if config.uses_images or has_target(options):
+        memory -= IMAGE_BYTES
+    merging = finer_count(target, rows.count, config.allocation)
+    return block_count(rows, memory, merging=merging) > 1
+
+
+def rows_of(path: Path) -> "PlyRows | None":
+    """Open a binary PLY, which can be read in parts; return None for other files."""
+    from cvtgs.io.ply import open_rows
+
+    try:
+        return open_rows(path)
+    except (InputError, FileFormatError):
+        return None
+
+
+def simplify_blocks(
+    options: argparse.Namespace,
+    config: "cvtgs.SimplifyConfig",
+    memory: int,
+    listener: ProgressListener,
+) -> "cvtgs.SimplifyReport":
+    """Simplify a file block by block, on this machine or on a cluster."""
+    if options.lod:
+        raise InvalidArgumentError(
+            f"--lod must be 0 unless for a streamed SOG, found {options.lod} for {options.input}."
+        )
+    with block_workers(options, memory) as (workers, share):
+        return cvtgs.outofcore.simplify_file(
+            options.input,
+            options.output,
+            options.rho,
+            count=options.count,
+            max_count=options.max_count,
+            memory=share,
+            boxes=() if options.keep is None else cvtgs.boxes.read_boxes(options.keep),
+            sh_degree=options.sh_degree,
+            source_axes=options.axes.source,
+            output_axes=options.axes.target,
+            simplifier=cvtgs.Simplifier(checkpoint_of(options), config=config, device="cpu"),
+            cameras=read_cameras(options),
+            workers=workers,
+            overwrite=options.overwrite,
+            listener=listener,
+        )

@@ -4,16 +4,12 @@ import argparse
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.display import say
-from cvtgs.cli.options import add_options, read_axes
+from cvtgs.cli.options import add_options
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.text import counted
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 Color = tuple[float, float, float]
 
@@ -23,11 +19,7 @@ COLORS: Mapping[str, Color] = {
     "white": (1.0, 1.0, 1.0),
 }
 AUTOMATIC_VIEWS = 8
-SCORED_SIZE = 640
-"""Longer side of scored images, pixels; shared so that all commands print the same scores."""
-
-_MOST_VIEWS = 10_000
-_MOST_SIZE = 1 << 14  # pixels; images of 4 : 3 take some gigabytes then
+SCORED_SIZE = 640  # longer side of images, pixels; shared, so all commands print the same scores
 
 
 def say_views(evaluation: "cvtgs.evaluation.Evaluation") -> None:
@@ -39,10 +31,7 @@ def say_views(evaluation: "cvtgs.evaluation.Evaluation") -> None:
 
 
 def add_view_options(parser: argparse.ArgumentParser, *, size: int, **helps: str) -> None:
-    """Add the options of cameras and images.
-
-    ``size`` is the default of ``--size``; ``helps`` is as in :func:`add_options`.
-    """
+    """Add the options of cameras and images; ``size`` is in pixels, ``helps`` other help texts."""
     add_options(parser, "--cameras", "--split", "--views", **helps)
     parser.add_argument(
         "--size",
@@ -54,18 +43,20 @@ def add_view_options(parser: argparse.ArgumentParser, *, size: int, **helps: str
     parser.set_defaults(default_size=size)
 
 
-def check_view_options(options: argparse.Namespace) -> None:
-    """Check the options of :func:`add_view_options` before any file is read."""
-    for name, most in (("views", _MOST_VIEWS), ("size", _MOST_SIZE)):
+def evaluation_settings(options: argparse.Namespace) -> "cvtgs.evaluation.EvaluationSettings":
+    """Check the options of :func:`add_view_options`; return settings of images and scores."""
+    for name, most in (("views", 10_000), ("size", 1 << 14)):  # larger images take gigabytes
         value = getattr(options, name)
-        if value is not None and value < 1:
-            raise InvalidArgumentError(f"--{name} must be at least 1, found {value}.")
-        if value is not None and value > most:
-            raise InvalidArgumentError(f"--{name} must be at most {most:,}, found {value:,}.")
+        if value is not None and not 1 <= value <= most:
+            raise InvalidArgumentError(f"--{name} must be from 1 to {most:,}, found {value:,}.")
     check_split(options)
     if getattr(options, "images", None) is not None and options.cameras is None:
         raise InvalidArgumentError("--images needs the cameras of the photographs: --cameras.")
-    background_color(options)
+    return cvtgs.evaluation.EvaluationSettings(
+        background=_color(options.background),
+        lpips=getattr(options, "lpips", "auto"),
+        backend=options.backend,
+    )
 
 
 def check_split(options: argparse.Namespace) -> None:
@@ -81,9 +72,8 @@ def read_cameras(options: argparse.Namespace) -> "cvtgs.Cameras | None":
     return cvtgs.load_cameras(options.cameras, split=options.split)
 
 
-def background_color(options: argparse.Namespace) -> Color:
-    """Read ``--background``."""
-    word = options.background.strip().lower()
+def _color(text: str) -> Color:
+    word = text.strip().lower()
     if word in COLORS:
         return COLORS[word]
     try:
@@ -93,18 +83,9 @@ def background_color(options: argparse.Namespace) -> Color:
     if not all(0 <= part <= 1 for part in (red, green, blue)):
         raise InvalidArgumentError(
             f"--background must be {', '.join(COLORS)} or red,green,blue from 0 to 1, "
-            f"found {options.background!r}."
+            f"found {text!r}."
         )
     return red, green, blue
-
-
-def evaluation_settings(options: argparse.Namespace) -> "cvtgs.evaluation.EvaluationSettings":
-    """Return the settings of rendering and scoring; without the option, LPIPS is ``auto``."""
-    return cvtgs.evaluation.EvaluationSettings(
-        background=background_color(options),
-        lpips=getattr(options, "lpips", "auto"),
-        backend=options.backend,
-    )
 
 
 def choose_cameras(
@@ -114,10 +95,7 @@ def choose_cameras(
     most: int | None = None,
     held_out: bool = False,
 ) -> "cvtgs.Cameras":
-    """Read ``--cameras`` or the cameras beside the scene; otherwise choose automatic views.
-
-    With ``held_out``, only the test split of the cameras beside the scene is used, if there is one.
-    """
+    """Read ``--cameras``, or those beside the scene (of the test split), or choose views."""
     size, views = options.size or options.default_size, options.views or AUTOMATIC_VIEWS
     cameras = read_cameras(options)
     if cameras is not None:
@@ -144,12 +122,7 @@ def own_cameras(
     """Find the cameras beside a scene, unless ``--axes`` turns the scene away from them."""
     from cvtgs.io.axes import SCENE_AXES
 
-    if read_axes(getattr(options, "axes", None)).source not in (None, SCENE_AXES):
+    axes = getattr(options, "axes", None)
+    if axes is not None and axes.source not in (None, SCENE_AXES):
         return None
     return cvtgs.views.find_own_cameras(scene, path)
-
-
-def read_photographs(options: argparse.Namespace, cameras: "cvtgs.Cameras") -> "Tensor":
-    """Read the photographs of ``--images``."""
-    background = background_color(options)
-    return cvtgs.evaluation.load_photographs(options.images, cameras, background=background)

@@ -13,9 +13,7 @@ from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.text import columns, counted, printable
 
 WIDTH = 80  # maximum columns of a line of output
-
-TIE = "\N{NO-BREAK SPACE}"
-"""A space at which lines do not break; it is printed as an ordinary space."""
+TIE = "\N{NO-BREAK SPACE}"  # lines do not break here; it is printed as an ordinary space
 
 
 def say(text: str, *, file: TextIO | None = None, end: str = "\n", flush: bool = False) -> None:

@@ -10,11 +10,8 @@ import cvtgs
 from cvtgs.cli.cameras import (
     SCORED_SIZE,
     add_view_options,
-    background_color,
-    check_view_options,
     choose_cameras,
     evaluation_settings,
-    read_photographs,
     say_views,
 )
 from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped, shortfall_note
@@ -26,9 +23,7 @@ from cvtgs.io.atomic import windows_fault, write_atomically
 from cvtgs.progress import ProgressEvent
 from cvtgs.text import MOST_LETTERS, counted, printable_name, size_text
 
-MOST_CAMERAS = 8
-"""Maximum number of cameras that a page shows, and that ``tradeoff`` scores from, by default."""
-
+MOST_CAMERAS = 8  # that a page shows, and that ``tradeoff`` scores from, by default
 ALPHA_MEANS = "alpha: mean |difference| of coverage; bias < 0: more of the background shows"
 
 
@@ -53,8 +48,7 @@ def render(options: argparse.Namespace) -> None:
     from cvtgs.io.atomic import make_folder
     from cvtgs.rendering.render import LEAST_COVER
 
-    check_view_options(options)
-    background = background_color(options)
+    settings = evaluation_settings(options)
     scene = cvtgs.io.load(options.input, trust_sizes=options.trust_sizes)
     scene = scene.to(chosen_device(options.device))
     cameras = choose_cameras(options, scene)
@@ -66,7 +60,9 @@ def render(options: argparse.Namespace) -> None:
     with progress_bars(quiet=options.quiet) as listener, torch.no_grad():
         for number, (path, camera) in enumerate(zip(paths, cameras.singles(), strict=True)):
             listener(ProgressEvent(stage="render", done=number, total=len(paths)))
-            found = cvtgs.render(scene, camera, backend=options.backend, background=background)
+            found = cvtgs.render(
+                scene, camera, backend=settings.backend, background=settings.background
+            )
             most_seen = max(most_seen, float(found.alpha.mean()))
             png = encode(as_bytes(found.rgb[0]), "png")
             write_atomically(path, png, overwrite=options.overwrite)
@@ -134,13 +130,16 @@ def add_evaluate(add_parser: AddParser) -> None:
 
 def evaluate(options: argparse.Namespace) -> None:
     """Run ``cvtgs evaluate``."""
-    check_view_options(options)
     settings = evaluation_settings(options)
     scenes, sizes = _read_scenes(options)
     (name, reference), *others = scenes.items()
     with progress_bars(quiet=options.quiet) as listener:
         cameras = choose_cameras(options, reference)
-        photographs = None if options.images is None else read_photographs(options, cameras)
+        photographs = None
+        if options.images is not None:
+            photographs = cvtgs.evaluation.load_photographs(
+                options.images, cameras, background=settings.background
+            )
         evaluation = cvtgs.evaluate(
             reference,
             dict(others),
@@ -204,7 +203,7 @@ def compare(options: argparse.Namespace) -> None:
     """Run ``cvtgs compare``."""
     from cvtgs.evaluation.comparison_files import check_comparison_files
 
-    check_view_options(options)
+    settings = evaluation_settings(options)
     check_comparison_files(options.output, overwrite=options.overwrite)
     check_page(options)
     scenes, sizes = _read_scenes(options)
@@ -217,7 +216,7 @@ def compare(options: argparse.Namespace) -> None:
             reference_name=name,
             sizes=sizes,
             most_images=options.views or MOST_CAMERAS,
-            settings=evaluation_settings(options),
+            settings=settings,
             listener=listener,
         )
         paths = cvtgs.evaluation.write_comparison(
@@ -269,7 +268,11 @@ def tradeoff(options: argparse.Namespace) -> None:
     from cvtgs.tradeoff.files import check_tradeoff_files
     from cvtgs.tradeoff.measure import tasks_of
 
-    check_view_options(options)
+    settings = evaluation_settings(options)
+    photographs = None
+    if options.images is not None:
+        read = cvtgs.evaluation.load_photographs
+        photographs = partial(read, options.images, background=settings.background)
     presets = None if options.presets is None else read_words(options.presets)
     kept = tuple(task.file_name for task in tasks_of(presets, options.rho) if options.save)
     check_tradeoff_files(options.output, more=kept, overwrite=options.overwrite)
@@ -279,8 +282,8 @@ def tradeoff(options: argparse.Namespace) -> None:
             presets=presets,
             rhos=options.rho,
             cameras=lambda scene: choose_cameras(options, scene, most=MOST_CAMERAS, held_out=True),
-            photographs=None if options.images is None else partial(read_photographs, options),
-            settings=evaluation_settings(options),
+            photographs=photographs,
+            settings=settings,
             device=options.device,
             folder=options.output if options.save else None,
             trust_sizes=options.trust_sizes,

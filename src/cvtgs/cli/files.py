@@ -24,7 +24,6 @@ from cvtgs.cli.jobs import (
 from cvtgs.cli.options import (
     AddParser,
     add_options,
-    read_axes,
     read_numbers,
     read_scene,
     read_settings,
@@ -33,13 +32,6 @@ from cvtgs.cli.paths import any_path
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn, without_warnings
 from cvtgs.tags import TWO_SCALES, described_tags
 from cvtgs.text import counted, first_of, size_text
-
-_NUMBERS = {
-    "--crop-box": "six numbers x,y,z,X,Y,Z, the minimum and maximum coordinates",
-    "--crop-sphere": "four numbers x,y,z,r, the centre and radius",
-    "--rotate": "three numbers x,y,z, degrees about each axis",
-    "--translate": "three numbers x,y,z",
-}
 
 
 def add_edit_options(parser: argparse.ArgumentParser) -> None:
@@ -100,10 +92,11 @@ def read_edits(options: argparse.Namespace) -> list[tuple[str, Edit]]:
 
     edit, edits, regions = cvtgs.edit, list[tuple[str, Edit]](), list[Box | Sphere]()
     for text in options.crop_box:
-        x0, y0, z0, x1, y1, z1 = _numbers("--crop-box", text, 6)
+        of = "x,y,z,X,Y,Z, the minimum and maximum coordinates"
+        x0, y0, z0, x1, y1, z1 = read_numbers("--crop-box", text, 6, of=of)
         regions.append(Box(min=(x0, y0, z0), max=(x1, y1, z1)))
     for text in options.crop_sphere:
-        x, y, z, radius = _numbers("--crop-sphere", text, 4)
+        x, y, z, radius = read_numbers("--crop-sphere", text, 4, of="x,y,z,r, centre and radius")
         regions.append(Sphere(center=(x, y, z), radius=radius))
     if regions:
         given = {"--crop-box": options.crop_box, "--crop-sphere": options.crop_sphere}
@@ -119,18 +112,15 @@ def read_edits(options: argparse.Namespace) -> list[tuple[str, Edit]]:
         scale = 1.0 if options.scale is None else options.scale
         if not 0 < scale < math.inf:
             raise InvalidArgumentError(f"--scale must be above 0 and finite, found {scale}.")
-        rotate, translate = (
-            "0,0,0" if text is None else text for text in (options.rotate, options.translate)
-        )
-        a, b, c = _numbers("--rotate", rotate, 3)
-        x, y, z = _numbers("--translate", translate, 3)
+        a, b, c = x, y, z = 0.0, 0.0, 0.0
+        if options.rotate is not None:
+            of = "x,y,z, degrees about each axis"
+            a, b, c = read_numbers("--rotate", options.rotate, 3, of=of)
+        if options.translate is not None:
+            x, y, z = read_numbers("--translate", options.translate, 3, of="x,y,z")
         motion = Motion.of_angles((a, b, c), scale=scale, shift=(x, y, z))
         edits.append(("moved", lambda scene: edit.move(scene, motion)))
     return edits
-
-
-def _numbers(name: str, text: str, count: int) -> list[float]:
-    return read_numbers(text, (count,), name=name, meaning=_NUMBERS[name])
 
 
 def edited(
@@ -301,7 +291,6 @@ def add_convert(add_parser: AddParser) -> None:
 
 def convert(options: argparse.Namespace) -> None:
     """Run ``cvtgs convert``."""
-    read_axes(options.axes)
     edits = read_edits(options)
     with open_jobs(options) as jobs:
         for job in jobs:
@@ -323,7 +312,7 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
     from cvtgs.io.limits import LOST_DIGITS
 
     options = job.options
-    axes, trust = read_axes(options.axes), options.trust_sizes
+    axes, trust = options.axes, options.trust_sizes
     scenes = [cvtgs.io.load(options.input, axes=axes.source, trust_sizes=trust, lod=options.lod)]
     for path in options.merge:
         if str(path) == STREAM:

@@ -33,11 +33,6 @@ class ChosenPreset(NamedTuple):
     left: float  # seconds
     advice: str
 
-    def late_note(self, seconds: float) -> list[str]:
-        """Return a sentence if a run and its file took longer than the time that was left."""
-        took = f"Simplifying and writing took {seconds:.1f} s, where {self.left:.1f} s were left"
-        return [f"{took}; {self.advice}."] if seconds > self.left else []
-
 
 def has_target(options: argparse.Namespace) -> bool:
     """Return whether a quality is to be reached."""
@@ -57,16 +52,12 @@ def check_goals(options: argparse.Namespace) -> None:
         raise InvalidArgumentError(
             f"--time-budget must be above 0 and finite, found {options.time_budget:g} s."
         )
-    excluded = {
-        "--preset": options.preset is not None,
-        "--config": options.config is not None,
-        "--ckpt": options.ckpt not in ("auto", "none"),
-        "--refine": options.refine is not None,
-        "--refine-steps": options.refine_steps is not None,
-        "--target-psnr": options.target_psnr is not None,
-        "--target-ssim": options.target_ssim is not None,
-    }
-    wrong = [name for name, is_given in excluded.items() if is_given]
+    excluded = ("preset", "config", "refine", "refine_steps", "target_psnr", "target_ssim")
+    wrong = [
+        f"--{name.replace('_', '-')}" for name in excluded if getattr(options, name) is not None
+    ]
+    if options.ckpt not in ("auto", "none"):
+        wrong.append("--ckpt")
     if wrong:
         raise InvalidArgumentError(
             f"--time-budget chooses the preset and cannot be used with {', '.join(wrong)}."
@@ -136,10 +127,7 @@ def choose_preset(
 def _seconds_to_write(
     options: argparse.Namespace, scene: "cvtgs.GaussianScene", count: int
 ) -> float:
-    """Estimate the seconds that a scene of some Gaussians takes to write in the format of OUT.
-
-    They are 0 if no sample can be written, which the file of the scene may tell better.
-    """
+    """Estimate the seconds that writing OUT takes; 0 if no sample of the scene can be written."""
     some = scene[: min(count, SAMPLED)]
     some, seconds = some[cvtgs.validity.writable_rows(some)], list[float]()
     try:
@@ -163,11 +151,7 @@ def search_target(
     axes: str | None,
     listener: "cvtgs.ProgressListener",
 ) -> tuple["cvtgs.budget.Found", str]:
-    """Search for the smallest scene whose file, with the given axes, reaches the quality.
-
-    Without ``--cameras``, the views are those of ``cvtgs evaluate``, unless a preset is fitted to
-    them. Returns the scene, and the sentence about its scores.
-    """
+    """Search for the smallest scene whose file reaches the quality; return it, and a sentence."""
     is_rounded = rounds(options.output)
     heldout, views = cameras, "the given cameras"
     if simplifier.config.uses_images:

@@ -9,7 +9,6 @@ import cvtgs
 from cvtgs.cli.cameras import (
     SCORED_SIZE,
     add_view_options,
-    check_view_options,
     choose_cameras,
     evaluation_settings,
     own_cameras,
@@ -22,9 +21,8 @@ from cvtgs.cli.options import (
     add_options,
     checkpoint_of,
     dotted,
-    preset_of,
     ratios,
-    read_axes,
+    read_config,
     read_settings,
 )
 from cvtgs.cli.paths import is_same_file
@@ -82,8 +80,7 @@ def add_levels(add_parser: AddParser) -> None:
 
 def levels(options: argparse.Namespace) -> None:
     """Run ``cvtgs levels``."""
-    check_view_options(options)
-    axes = read_axes(options.axes)
+    settings = evaluation_settings(options)
     default = PLAIN_RHOS if options.stream is None else STREAM_RHOS
     rhos = sorted(options.rho or ratios(default), reverse=True)
     check_suffix(options.suffix)
@@ -94,28 +91,25 @@ def levels(options: argparse.Namespace) -> None:
     _check_input(options, names)
     if options.stream is None:
         cvtgs.levels.check_levels(options.output, names, overwrite=options.overwrite)
-    config = cvtgs.SimplifyConfig.compose(
-        file=options.config, preset=preset_of(options), settings=read_settings(options.settings)
-    )
-    checkpoint = checkpoint_of(options)
+    config = read_config(options, read_settings(options.settings))
     is_scored = options.stream is None and not options.no_scores
     if options.cameras is not None and not (is_scored or config.uses_images or options.quiet):
         say_wrapped(f"--cameras is not used: {config.preset} renders no images.")
-    if options.stream is not None and stream_blocks(options, checkpoint, config, rhos, axes):
+    if options.stream is not None and stream_blocks(options, config, rhos):
         return
     with progress_bars(quiet=options.quiet) as listener:
         simplifier = cvtgs.Simplifier(
-            checkpoint, config=config, device=options.device, listener=listener
+            checkpoint_of(options), config=config, device=options.device, listener=listener
         )
-        scene = cvtgs.load(options.input, axes=axes.source, trust_sizes=options.trust_sizes)
+        scene = cvtgs.load(options.input, axes=options.axes.source, trust_sizes=options.trust_sizes)
         if options.stream is not None and options.rho is None:
             rhos = of_different_sizes(rhos, len(scene), int(cvtgs.validity.valid_rows(scene).sum()))
         degree = scene.sh_degree if options.sh_degree is None else options.sh_degree
         cameras = _cameras_to_fit(options, scene) if config.uses_images else None
-        views = _checked_views(options, scene) if is_scored else None
+        views = _checked_views(options, scene, settings) if is_scored else None
         made = simplifier.levels(scene.with_sh_degree(degree), rhos, cameras=cameras)
         if options.stream is not None:
-            stream_levels(options, made, axes, listener)
+            stream_levels(options, made, listener)
             return
         index = cvtgs.levels.write_levels(
             made,
@@ -123,11 +117,11 @@ def levels(options: argparse.Namespace) -> None:
             rhos=rhos,
             source=options.input.name,
             suffix=suffix,
-            axes=axes.target,
+            axes=options.axes.target,
             overwrite=options.overwrite,
         )
         if views is not None:
-            evaluation = _score(options, scene, names, views, listener)
+            evaluation = _score(options, scene, names, views, settings, listener)
             index = cvtgs.levels.add_scores(index, options.output, evaluation)
     if not options.quiet:
         if views is not None:
@@ -177,14 +171,18 @@ def _cameras_to_fit(
     return None if own is None else own.cameras
 
 
-def _checked_views(options: argparse.Namespace, scene: "cvtgs.GaussianScene") -> "cvtgs.Cameras":
+def _checked_views(
+    options: argparse.Namespace,
+    scene: "cvtgs.GaussianScene",
+    settings: "cvtgs.evaluation.EvaluationSettings",
+) -> "cvtgs.Cameras":
     """Return the views that score; raise before the long work if the levels cannot be scored."""
     from cvtgs.devices import chosen_device
     from cvtgs.evaluation.compare import check_scores
 
     full = cvtgs.validity.valid_part(scene).to(chosen_device(options.device))
     views = choose_cameras(options, full)
-    check_scores(full, views, settings=evaluation_settings(options), name=options.input.name)
+    check_scores(full, views, settings=settings, name=options.input.name)
     return views
 
 
@@ -193,18 +191,18 @@ def _score(
     scene: "cvtgs.GaussianScene",
     names: Sequence[str],
     views: "cvtgs.Cameras",
+    settings: "cvtgs.evaluation.EvaluationSettings",
     listener: "cvtgs.ProgressListener",
 ) -> "cvtgs.evaluation.Evaluation":
     """Score the files of the levels against the full scene."""
     from cvtgs.devices import chosen_device
 
-    device, axes = chosen_device(options.device), read_axes(options.axes).target
+    device, axes = chosen_device(options.device), options.axes.target
     full = cvtgs.validity.valid_part(scene).to(device)
     files = {
         name: cvtgs.load(options.output / name, axes=axes, trust_sizes=True).to(device)
         for name in names
     }
-    settings = evaluation_settings(options)
     return cvtgs.evaluate(full, files, views, settings=settings, listener=listener)
 
 

@@ -25,7 +25,7 @@ from cvtgs.cli.evaluate import add_compare, add_evaluate, add_render, add_tradeo
 from cvtgs.cli.files import add_convert, add_info
 from cvtgs.cli.jobs import STREAM, check_one_scene
 from cvtgs.cli.levels import add_levels
-from cvtgs.cli.options import CommandParser
+from cvtgs.cli.options import CommandParser, read_axes
 from cvtgs.cli.simplify import add_simplify
 from cvtgs.cli.train import add_train
 from cvtgs.cli.view import add_view
@@ -33,11 +33,9 @@ from cvtgs.errors import CvtgsError, InvalidArgumentError, memory_errors
 from cvtgs.startup import load_torch
 from cvtgs.text import printable_name
 
+# Commands that write several files to one folder, which only one run at a time may do.
 WRITE_SEVERAL = ("levels", "render", "compare", "tradeoff", "demo", "train")
-"""Commands that write several files to one folder, which only one run at a time may do."""
-
 PATIENCE = 2.0  # seconds in which a second signal is ignored
-
 INTERRUPTED, PIPE_CLOSED = 130, 141  # exit status: 128 and the number of the signal
 BLOCKS_ADVICE = "process a binary .ply in blocks with --memory AMOUNT, for example 2GB"
 
@@ -106,19 +104,17 @@ def _run(words: Sequence[str], stop: "_Stop") -> None:
             with stop.held():  # an interrupted import of torch may end in its C++ code
                 load_torch()
         with _lock(options), _without_empty_folder(options):
-            _run_command(options)
+            for name in ("input", "reference"):
+                check_one_scene(getattr(options, name, ""))
+                if str(getattr(options, name, "")) == STREAM and options.command != "info":
+                    raise InvalidArgumentError(
+                        f"{options.command} needs a file; simplify, convert and info read standard "
+                        f"input (-)."
+                    )
+            if "axes" in options:
+                options.axes = read_axes(options.axes)
+            options.run(options)
     flush_output()
-
-
-def _run_command(options: argparse.Namespace) -> None:
-    for name in ("input", "reference"):
-        check_one_scene(getattr(options, name, ""))
-        if str(getattr(options, name, "")) == STREAM and options.command != "info":
-            raise InvalidArgumentError(
-                f"{options.command} needs a file; simplify, convert and info read standard "
-                f"input (-)."
-            )
-    options.run(options)
 
 
 def _lock(options: argparse.Namespace) -> AbstractContextManager[None]:
@@ -183,11 +179,7 @@ def _fill_closed_streams() -> None:
 
 
 class _Stop:
-    """A handler of signals that raises KeyboardInterrupt and records the exit status.
-
-    Further signals soon after it are ignored: they would interrupt the wait for threads, and
-    Python would end while these compute.
-    """
+    """A handler of signals that raises KeyboardInterrupt and records the exit status."""
 
     def __init__(self) -> None:
         self.code: int | None = None
@@ -196,7 +188,7 @@ class _Stop:
 
     def __call__(self, signum: int, frame: FrameType | None) -> None:
         if time.monotonic() - self._raised < PATIENCE:
-            return
+            return  # a further signal would interrupt the wait for threads that still compute
         self.code = 128 + signum
         if not self.is_held:
             self._raise()

@@ -25,8 +25,6 @@ READABLE = (
 WRITABLE = ".ply, .compressed.ply, .spz, .splat, .sog, .glb, .gltf, .spz.glb or .usda"
 PRESET_NAMES = "draft, fast, standard, matched, high (from the fastest to the best) or paper"
 CAMERA_FILES = "transforms.json, a COLMAP model, cameras.json, or a folder of these"
-
-
 _UNITS = {"ms": 1e-3, "": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}  # in seconds
 
 
@@ -251,8 +249,7 @@ class CommandParser(argparse.ArgumentParser):
         super().error(message)
 
 
-AddParser = Callable[..., CommandParser]
-"""Type of the ``add_parser`` method of argparse, which makes the parser of one command."""
+AddParser = Callable[..., CommandParser]  # argparse's method that makes the parser of a command
 
 
 def add_options(parser: argparse.ArgumentParser, *names: str, **helps: str) -> None:
@@ -263,14 +260,15 @@ def add_options(parser: argparse.ArgumentParser, *names: str, **helps: str) -> N
         parser.add_argument(*name.split("/"), **{**_SHARED[name], **texts})
 
 
-def read_numbers(text: str, counts: Sequence[int], *, name: str, meaning: str) -> list[float]:
-    """Read finite numbers separated by commas; raise unless there are as many as one of counts."""
+def read_numbers(name: str, text: str, *counts: int, of: str = "") -> list[float]:
+    """Read as many finite numbers as one of counts from an option; ``of`` says what they are."""
     try:
         numbers = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
         numbers = []
     if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
-        raise InvalidArgumentError(f"{name} must be {meaning}, found {text!r}.")
+        wanted = f"{' or '.join(map(str, counts))} numbers {of or 'separated by commas'}"
+        raise InvalidArgumentError(f"{name} must be {wanted}, found {text!r}.")
     return numbers
 
 
@@ -338,12 +336,12 @@ def checkpoint_of(options: argparse.Namespace) -> str | None:
     return None if options.ckpt == "none" else options.ckpt
 
 
-def preset_of(options: argparse.Namespace) -> str | None:
-    """Return ``--preset``; without it and ``--config``, the preset of ``--ckpt``."""
+def read_config(options: argparse.Namespace, settings: Mapping[str, str]) -> "cvtgs.SimplifyConfig":
+    """Compose the settings with ``--config`` and ``--preset``, or else the preset of ``--ckpt``."""
     preset: str | None = options.preset
     if preset is None and options.config is None and options.ckpt not in ("auto", "none"):
         preset = cvtgs.mergenet.load_checkpoint(options.ckpt).info.preset
-    return preset
+    return cvtgs.SimplifyConfig.compose(file=options.config, preset=preset, settings=settings)
 
 
 def read_scene(

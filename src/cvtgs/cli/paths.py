@@ -2,15 +2,15 @@
 
 import argparse
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import cvtgs
 from cvtgs.errors import InputError, InvalidArgumentError
 
+# Suffixes of files that commands read or write; a new folder of such a name is a mistake.
 _SCENES = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf", ".usda")
-
 FILE_SUFFIXES = (*_SCENES, ".html", ".json", ".csv", ".png", ".jpg")
-"""Suffixes of files that commands read or write; a new folder of such a name is a mistake."""
 
 
 def any_path(text: str) -> Path:
@@ -55,10 +55,7 @@ def names_file(path: Path) -> bool:
 
 
 def check_written_files(options: argparse.Namespace) -> None:
-    """Raise if OUT or the report would overwrite each other or an input.
-
-    Only OUT may replace IN, which is read before OUT is written.
-    """
+    """Raise if OUT or the report would overwrite each other or an input, but for OUT and IN."""
     taken = {
         f"--{name}": Path(value)
         for name in ("config", "cameras", "keep", "ckpt")
@@ -70,15 +67,9 @@ def check_written_files(options: argparse.Namespace) -> None:
                 raise InvalidArgumentError(
                     f"{name} and {other} must be different files, found {path} for both."
                 )
-        taken |= {"IN": _found_file(options.input), "OUT": options.output}
-
-
-def _found_file(scene: Path) -> Path:
-    """Return the file of a scene, or its path if there is none, which is an error later."""
-    try:
-        return cvtgs.io.scene_file(scene)
-    except InputError:
-        return scene
+        taken["OUT"] = options.output  # which may replace IN, since that is read before
+        with suppress(InputError):  # an error later
+            taken["IN"] = cvtgs.io.scene_file(options.input)
 
 
 def is_same_file(path: Path, other: Path) -> bool:

@@ -1,14 +1,21 @@
 """``cvtgs simplify``: simplify scenes to a size, quality or time, in memory or in blocks."""
 
 import argparse
+import json
 import time
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import cvtgs
-from cvtgs.cli.blocks import add_block_options, block_workers, check_block_device, memory_of
+from cvtgs.cli.blocks import (
+    add_block_options,
+    block_memory,
+    memory_of,
+    needs_blocks,
+    rows_of,
+    simplify_blocks,
+)
 from cvtgs.cli.cameras import check_split, own_cameras, read_cameras
 from cvtgs.cli.display import TIE, progress_bars, report_notes
 from cvtgs.cli.goals import (
@@ -33,21 +40,17 @@ from cvtgs.cli.options import (
     add_options,
     checkpoint_of,
     count,
-    preset_of,
     ratio,
-    read_axes,
+    read_config,
     read_scene,
     read_settings,
     seconds,
 )
 from cvtgs.cli.paths import any_path, check_written_files, new_file
-from cvtgs.cli.reports import report_file
-from cvtgs.errors import ConfigError, FileFormatError, InputError, InvalidArgumentError, warn
+from cvtgs.errors import InvalidArgumentError, OutputError, OutputExistsError, warn
+from cvtgs.io.atomic import write_atomically
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.text import counted
-
-if TYPE_CHECKING:
-    from cvtgs.io.ply import PlyRows
 
 
 def add_simplify(add_parser: AddParser) -> None:
@@ -151,35 +154,53 @@ def add_simplify(add_parser: AddParser) -> None:
 
 def simplify(options: argparse.Namespace) -> None:
     """Run ``cvtgs simplify``."""
-    read_axes(options.axes)
     check_split(options)
     check_goals(options)
-    checkpoint = checkpoint_of(options)
     settings = _refine_settings(options) | read_settings(options.settings, options.effects)
-    config = cvtgs.SimplifyConfig.compose(
-        file=options.config, preset=preset_of(options), settings=settings
-    )
+    config = read_config(options, settings)
     with open_jobs(options) as jobs:
         for job in jobs:
             check_written_files(job.options)
             cvtgs.io.check_save(job.options.output, overwrite=options.overwrite)
-        with report_file(options) as file:
+        if options.report is not None:
+            cvtgs.io.check_output(options.report, overwrite=options.overwrite)
+        entries: list[dict[str, Any]] = []  # of many scenes
 
-            def work(job: SceneJob) -> Outcome:
-                outcome, report = _simplify_one(job, checkpoint, config, settings)
-                for other in jobs:
-                    other.options.recalibrate = False  # once is enough
-                file.add(job, report)
-                return outcome
+        def keep(job: SceneJob, *, error: str | None = None, report: object = None) -> None:
+            paths = {"input": str(job.options.input), "output": str(job.options.output)}
+            entries.append({**paths, "error": error, "report": report})
 
-            run_jobs(jobs, work, failed=file.add_error)
+        def work(job: SceneJob) -> Outcome:
+            outcome, report = _simplify_one(job, config, settings)
+            for other in jobs:
+                other.options.recalibrate = False  # once is enough
+            if job.is_one_of_many:
+                keep(job, report=json.loads(report.to_json()))
+            else:
+                _write_report(options, report.to_json(), f"the scene {job.options.output} was")
+            return outcome
+
+        try:
+            run_jobs(jobs, work, failed=lambda job, error: keep(job, error=str(error)))
+        finally:  # also if some of many scenes failed, or after an interrupt
+            if entries:
+                text = json.dumps(entries, indent=2) + "\n"
+                _write_report(options, text, f"the scenes in {options.folder} were")
+
+
+def _write_report(options: argparse.Namespace, text: str, written: str) -> None:
+    """Write the file of ``--report``, if it was asked for."""
+    if options.report is None:
+        return
+    try:
+        write_atomically(options.report, text.encode(), overwrite=options.overwrite)
+    except (OutputError, OutputExistsError) as error:
+        reason = str(error).removesuffix("; nothing was written.").rstrip(".")
+        raise OutputError(f"{reason}; {written} written, the report was not.") from error
 
 
 def _simplify_one(
-    job: SceneJob,
-    checkpoint: str | None,
-    config: "cvtgs.SimplifyConfig",
-    settings: Mapping[str, str],
+    job: SceneJob, config: "cvtgs.SimplifyConfig", settings: Mapping[str, str]
 ) -> "tuple[Outcome, cvtgs.SimplifyReport]":
     """Simplify one scene, in memory or block by block; return the result to print and report."""
     options, notes = job.options, list[str]()
@@ -187,12 +208,11 @@ def _simplify_one(
     with progress_bars(quiet=options.quiet, transient=job.is_one_of_many) as listener:
         memory = block_memory(options, config)
         if memory is not None:
-            simplifier = cvtgs.Simplifier(checkpoint, config=config, device="cpu")
-            report = _simplify_blocks(options, simplifier, memory, listener)
+            report = simplify_blocks(options, config, memory, listener)
             if options.cameras is None and report.views not in ("found", "none"):
                 notes.append(f"Rendered from {report.views} found beside {options.input}.")
         else:
-            report, notes = _simplify_in_memory(options, checkpoint, config, settings, listener)
+            report, notes = _simplify_in_memory(options, config, settings, listener)
         used = report.config
         if options.cameras is not None and not (has_target(options) or used.uses_images):
             notes.append(f"--cameras was not used: {used.preset} renders no images.")
@@ -205,7 +225,7 @@ def _simplify_one(
         seconds = (f"{stage.stage}{TIE}{stage.seconds:.2f}" for stage in report.stages)
         of_what = " of all tries" if searched else ""
         notes.insert(0, f"Seconds{of_what}: {', '.join(seconds)}.")
-    if memory is None and options.memory is not None and _rows_of(options.input) is None:
+    if memory is None and options.memory is not None and rows_of(options.input) is None:
         notes.append("In one piece: --memory has an effect on binary .ply files only.")
     if report.kept_count:
         notes.append(f"{counted(report.kept_count, 'Gaussian')} in the boxes of --keep.")
@@ -237,7 +257,6 @@ def _unused(settings: Mapping[str, str], config: "cvtgs.SimplifyConfig") -> list
 
 def _simplify_in_memory(
     options: argparse.Namespace,
-    checkpoint: str | None,
     config: "cvtgs.SimplifyConfig",
     settings: Mapping[str, str],
     listener: ProgressListener,
@@ -246,7 +265,7 @@ def _simplify_in_memory(
     from cvtgs.outofcore.resume import remove_job_files
 
     notes = []
-    axes = read_axes(options.axes)
+    axes = options.axes
     search = has_target(options)  # results are scored against all of IN
     scene = read_scene(options, config, axes=axes.source, all_bands=search)
     if search:
@@ -254,7 +273,7 @@ def _simplify_in_memory(
     cameras, chosen = read_cameras(options), None
     if options.time_budget is not None:
         rendering = cvtgs.SimplifyConfig(preset="matched")
-        fits = options.memory is None or not _needs_blocks(options, memory_of(options), rendering)
+        fits = options.memory is None or not needs_blocks(options, memory_of(options), rendering)
         chosen = choose_preset(options, scene, settings, listener, with_images=fits)
         config = cvtgs.SimplifyConfig.compose(preset=chosen.name, settings=settings)
         notes.append(chosen.reason)
@@ -266,7 +285,10 @@ def _simplify_in_memory(
                 f"Rendered from {counted(len(cameras), 'camera')} found in {own.source.resolve()}."
             )
     simplifier = cvtgs.Simplifier(
-        checkpoint, config=config, device=options.device, listener=silent if search else listener
+        checkpoint_of(options),
+        config=config,
+        device=options.device,
+        listener=silent if search else listener,
     )
     if search:
         found, scores = search_target(
@@ -291,8 +313,12 @@ def _simplify_in_memory(
     started = time.perf_counter()
     make_output_folder(options)
     cvtgs.io.save(small, options.output, overwrite=options.overwrite, axes=axes.target)
-    if chosen is not None:
-        notes += chosen.late_note(report.seconds + time.perf_counter() - started)
+    took = report.seconds + time.perf_counter() - started
+    if chosen is not None and took > chosen.left:
+        notes.append(
+            f"Simplifying and writing took {took:.1f} s, where {chosen.left:.1f} s were left; "
+            f"{chosen.advice}."
+        )
     remove_job_files(options.output)
     return report, notes
 
@@ -312,89 +338,3 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
     steps, seconds = options.refine_steps or 0, options.refine or 0.0
     exact = {"refine.lengthening": "1"} if steps else {}
     return {"refine.steps": str(steps), "refine.seconds": str(seconds), **exact}
-
-
-def block_memory(options: argparse.Namespace, config: "cvtgs.SimplifyConfig") -> int | None:
-    """Return the bytes for simplifying in blocks; None if blocks are not needed or not possible."""
-    from cvtgs.outofcore.run import check_config
-
-    memory = memory_of(options)
-    if options.scheduler is None and not _needs_blocks(options, memory, config):
-        return None
-    try:
-        for name in ("target_psnr", "target_ssim", "time_budget"):
-            if getattr(options, name) is not None:
-                images = "" if name == "time_budget" else " and 400 MB for images of it"
-                raise InvalidArgumentError(
-                    f"--{name.replace('_', '-')} cannot be used with blocks: it needs memory for "
-                    f"the whole scene{images} at once."
-                )
-        check_block_device(options)
-        check_config(config)
-    except (ConfigError, InvalidArgumentError):
-        if options.memory is not None or options.scheduler is not None:
-            raise
-        return None
-    return memory
-
-
-def _needs_blocks(options: argparse.Namespace, memory: int, config: "cvtgs.SimplifyConfig") -> bool:
-    """Return whether a file does not fit; only binary PLYs can be read in parts, and simplified."""
-    from cvtgs.grouping import finer_count
-    from cvtgs.outofcore.memory import IMAGE_BYTES, block_count
-
-    if config.uses_images or has_target(options):
-        memory -= IMAGE_BYTES
-    rows = _rows_of(options.input)
-    if rows is None:
-        return False
-    sizes = {"count": options.count, "max_count": options.max_count}
-    target = rows.count
-    if options.rho is not None or set(sizes.values()) != {None}:  # else a quality is wanted
-        target = cvtgs.target_count(rows.count, options.rho, **sizes)
-        if target == rows.count:
-            return False
-    merging = finer_count(target, rows.count, config.allocation)
-    return block_count(rows, memory, merging=merging) > 1
-
-
-def _rows_of(path: Path) -> "PlyRows | None":
-    """Open a binary PLY, which can be read in parts; return None for other files."""
-    from cvtgs.io.ply import open_rows
-
-    try:
-        return open_rows(path)
-    except (InputError, FileFormatError):
-        return None
-
-
-def _simplify_blocks(
-    options: argparse.Namespace,
-    simplifier: "cvtgs.Simplifier",
-    memory: int,
-    listener: ProgressListener,
-) -> "cvtgs.SimplifyReport":
-    """Simplify a file block by block, on this machine or on a cluster."""
-    axes = read_axes(options.axes)
-    if options.lod:
-        raise InvalidArgumentError(
-            f"--lod must be 0 unless for a streamed SOG, found {options.lod} for {options.input}."
-        )
-    with block_workers(options, memory) as (workers, share):
-        return cvtgs.outofcore.simplify_file(
-            options.input,
-            options.output,
-            options.rho,
-            count=options.count,
-            max_count=options.max_count,
-            memory=share,
-            boxes=() if options.keep is None else cvtgs.boxes.read_boxes(options.keep),
-            sh_degree=options.sh_degree,
-            source_axes=axes.source,
-            output_axes=axes.target,
-            simplifier=simplifier,
-            cameras=read_cameras(options),
-            workers=workers,
-            overwrite=options.overwrite,
-            listener=listener,
-        )

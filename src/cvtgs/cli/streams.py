@@ -5,23 +5,21 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import zip_longest
-from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.blocks import add_block_options, block_workers, check_block_device, memory_of
 from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped, shortfall_note
-from cvtgs.cli.options import read_axes, read_numbers
+from cvtgs.cli.options import checkpoint_of, read_numbers
 from cvtgs.errors import ConfigError, FileFormatError, InputError, InvalidArgumentError
 from cvtgs.text import size_text
 
-if TYPE_CHECKING:
-    from cvtgs.cli.options import FileAxes
-
 STREAMS = ("sog", "3dtiles")
-OF_STREAMS = ("chunk", "environment", "memory", "workers", "scheduler", "place", "transform")
-KIND_OF = {"environment": " sog", "place": " 3dtiles", "transform": " 3dtiles"}
-OF_SCORES = {"views": None, "size": None, "background": "black", "backend": "auto"}
-"""Options of scores, and their defaults."""
+OF_STREAMS = {  # kinds by option
+    **dict.fromkeys(("chunk", "memory", "workers", "scheduler"), STREAMS),
+    "environment": ("sog",),
+    **dict.fromkeys(("place", "transform"), ("3dtiles",)),
+}
+OF_SCORES = {"views": None, "size": None, "background": "black", "backend": "auto"}  # defaults
 
 
 def add_stream_options(parser: argparse.ArgumentParser) -> None:
@@ -72,11 +70,12 @@ def check_stream_options(options: argparse.Namespace) -> None:
     scoring = [name for name, default in OF_SCORES.items() if getattr(options, name) != default]
     if options.no_scores and scoring:
         raise InvalidArgumentError(f"--{scoring[0]} cannot be used with --no-scores.")
+    for name, kinds in OF_STREAMS.items():
+        if getattr(options, name) is not None and options.stream not in kinds:
+            kind = "" if kinds == STREAMS else f" {kinds[0]}"
+            found = "" if options.stream is None else f", found {options.stream}"
+            raise InvalidArgumentError(f"--{name} needs --stream{kind}{found}.")
     if options.stream is None:
-        for name in OF_STREAMS:
-            if getattr(options, name) is not None:
-                kind = KIND_OF.get(name, "")
-                raise InvalidArgumentError(f"--{name} needs --stream{kind}.")
         return
     excluded = [name for name in ("viewer", "suffix") if getattr(options, name)] + scoring
     if excluded:
@@ -84,7 +83,7 @@ def check_stream_options(options: argparse.Namespace) -> None:
             f"--{excluded[0]} cannot be used with --stream, which sets the format, is for viewers "
             f"that load chunks, and is not scored."
         )
-    if options.stream == "3dtiles" and read_axes(options.axes).target is not None:
+    if options.stream == "3dtiles" and options.axes.target is not None:
         raise InvalidArgumentError(
             "--axes IN:OUT cannot be used with --stream 3dtiles, whose axes are fixed (z up); give "
             "only those of IN."
@@ -92,8 +91,6 @@ def check_stream_options(options: argparse.Namespace) -> None:
     if options.chunk is not None and options.chunk < 1:
         raise InvalidArgumentError(f"--chunk must be at least 1, found {options.chunk}.")
     far = options.environment
-    if far is not None and options.stream != "sog":
-        raise InvalidArgumentError(f"--environment needs --stream sog, found {options.stream}.")
     if far is not None and not 0 < far < math.inf:
         raise InvalidArgumentError(f"--environment must be above 0, found {far:g}.")
     read_transform(options)
@@ -108,17 +105,9 @@ def read_transform(options: argparse.Namespace) -> tuple[float, ...] | None:
 
     if options.place is None and options.transform is None:
         return None
-    if options.stream != "3dtiles":
-        raise InvalidArgumentError("--place and --transform need --stream 3dtiles.")
     if options.transform is not None:
-        meaning = "16 numbers separated by commas"
-        return check_transform(
-            read_numbers(options.transform, (16,), name="--transform", meaning=meaning)
-        )
-    meaning = "2 or 3 numbers separated by commas"
-    longitude, latitude, *height = read_numbers(
-        options.place, (2, 3), name="--place", meaning=meaning
-    )
+        return check_transform(read_numbers("--transform", options.transform, 16))
+    longitude, latitude, *height = read_numbers("--place", options.place, 2, 3)
     try:
         return geo_transform(longitude, latitude, *height)
     except InvalidArgumentError as error:
@@ -127,10 +116,8 @@ def read_transform(options: argparse.Namespace) -> tuple[float, ...] | None:
 
 def stream_blocks(
     options: argparse.Namespace,
-    checkpoint: str | None,
     config: "cvtgs.SimplifyConfig",
     rhos: Sequence[float],
-    axes: "FileAxes",
 ) -> bool:
     """Write a stream in blocks if the scene does not fit into memory; return whether it did."""
     from cvtgs.grouping import finer_count
@@ -179,9 +166,9 @@ def stream_blocks(
             chunk_gaussians=options.chunk or CHUNK_GAUSSIANS,
             environment_radii=options.environment,
             transform=read_transform(options),
-            axes=(axes.source or SCENE_AXES, axes.target or SCENE_AXES),
+            axes=(options.axes.source or SCENE_AXES, options.axes.target or SCENE_AXES),
             sh_degree=options.sh_degree,
-            simplifier=cvtgs.Simplifier(checkpoint, config=config, device="cpu"),
+            simplifier=cvtgs.Simplifier(checkpoint_of(options), config=config, device="cpu"),
             workers=workers,
             overwrite=options.overwrite,
             listener=listener,
@@ -200,7 +187,6 @@ def of_different_sizes(rhos: Sequence[float], total: int, valid: int) -> list[fl
 def stream_levels(
     options: argparse.Namespace,
     made: "Sequence[cvtgs.Level]",
-    axes: "FileAxes",
     listener: "cvtgs.ProgressListener",
 ) -> None:
     """Write levels that are in memory as a stream, and print its contents."""
@@ -208,10 +194,9 @@ def stream_levels(
     from cvtgs.streams import plan_stream, write_sog_stream, write_tiles
     from cvtgs.streams.plan import CHUNK_GAUSSIANS
 
-    if axes.target is not None:
+    if (target := options.axes.target) is not None:
         made = [
-            level._replace(scene=cvtgs.io.change_axes(level.scene, "rdf", axes.target))
-            for level in made
+            level._replace(scene=cvtgs.io.change_axes(level.scene, "rdf", target)) for level in made
         ]
     plan = plan_stream(
         made,
