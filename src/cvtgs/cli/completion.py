@@ -5,7 +5,6 @@ import io
 import sys
 from collections.abc import Iterator, Mapping
 from functools import partial
-from importlib.resources import files
 
 import cvtgs
 from cvtgs.cli.display import say
@@ -58,6 +57,8 @@ def values_of(action: argparse.Action) -> list[str]:
 
 def bash_script(commands: Mapping[str, argparse.ArgumentParser]) -> str:
     """Return the script for bash."""
+    from importlib.resources import files
+
     values, options = [], []
     for command, parser in commands.items():
         names = list[str]()
