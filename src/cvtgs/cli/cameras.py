@@ -2,22 +2,15 @@
 
 import argparse
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 
 import cvtgs
 from cvtgs.cli.display import say
-from cvtgs.cli.options import add_options
+from cvtgs.cli.options import add_options, read_numbers
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.text import counted
 
-Color = tuple[float, float, float]
-
-COLORS: Mapping[str, Color] = {
-    "black": (0.0, 0.0, 0.0),
-    "gray": (0.5, 0.5, 0.5),
-    "white": (1.0, 1.0, 1.0),
-}
+COLORS = {"black": [0.0, 0.0, 0.0], "gray": [0.5, 0.5, 0.5], "white": [1.0, 1.0, 1.0]}
 AUTOMATIC_VIEWS = 8
 SCORED_SIZE = 640  # longer side of images, pixels; shared, so all commands print the same scores
 
@@ -52,8 +45,11 @@ def evaluation_settings(options: argparse.Namespace) -> "cvtgs.evaluation.Evalua
     check_split(options)
     if getattr(options, "images", None) is not None and options.cameras is None:
         raise InvalidArgumentError("--images needs the cameras of the photographs: --cameras.")
+    word = options.background.strip().lower()
+    of = f"red,green,blue from 0 to 1, or {', '.join(COLORS)}"
+    red, green, blue = COLORS.get(word) or read_numbers("--background", word, 3, of=of)
     return cvtgs.evaluation.EvaluationSettings(
-        background=_color(options.background),
+        background=(red, green, blue),
         lpips=getattr(options, "lpips", "auto"),
         backend=options.backend,
     )
@@ -70,22 +66,6 @@ def read_cameras(options: argparse.Namespace) -> "cvtgs.Cameras | None":
     if options.cameras is None:
         return None
     return cvtgs.load_cameras(options.cameras, split=options.split)
-
-
-def _color(text: str) -> Color:
-    word = text.strip().lower()
-    if word in COLORS:
-        return COLORS[word]
-    try:
-        red, green, blue = (float(part) for part in word.split(","))
-    except ValueError:
-        red = green = blue = -1.0
-    if not all(0 <= part <= 1 for part in (red, green, blue)):
-        raise InvalidArgumentError(
-            f"--background must be {', '.join(COLORS)} or red,green,blue from 0 to 1, "
-            f"found {text!r}."
-        )
-    return red, green, blue
 
 
 def choose_cameras(
