@@ -45,7 +45,6 @@ _NO_MEMORY = re.compile(
 _NO_MEMORY_ON_WINDOWS = (8, 14, 1455)
 """NOT_ENOUGH_MEMORY, OUTOFMEMORY and COMMITMENT_LIMIT of Windows, whose texts are translated."""
 
-
 BLOCKS_ADVICE = (
     "free some, or simplify a binary .ply block by block: cvtgs simplify IN OUT --memory AMOUNT"
 )
@@ -86,22 +85,13 @@ class _FileError(CvtgsError, OSError):
     filename: Any
     errno: int | None
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _file_error, (type(self), self.args, self.errno, self.filename)
+    def __reduce__(self) -> tuple[Any, ...]:  # OSError pickles neither without the other
+        return type(self), self.args, {"errno": self.errno, "filename": self.filename}
 
     def about(self, path: str | os.PathLike[str], number: int | None) -> Self:
         """Return the error with the name of its file and the number of the system's error."""
         self.filename, self.errno = os.fspath(path), number
         return self
-
-
-def _file_error(
-    kind: type[_FileError], args: tuple[Any, ...], number: int | None, path: str | None
-) -> _FileError:
-    """Return an error as it was pickled."""
-    error = kind(*args)
-    error.errno, error.filename = number, path
-    return error
 
 
 class InputError(_FileError):
@@ -157,14 +147,12 @@ class DroppedDataWarning(UserWarning):
 
 
 def warn(text: str, category: type[Warning] = UserWarning) -> None:
-    """Issue a warning at the line of the caller's program that led to it.
-
-    Lines of cvtgs are skipped, and those between them: decorators of torch and of contextlib.
-    """
+    """Issue a warning at the line of the caller's program that led to it."""
     if issubclass(category, _LEFT_OUT.get()):
         return
     for rename in RENAMINGS.get():
         text = rename(text)
+    # Lines of cvtgs are skipped, and those between them: decorators of torch and of contextlib.
     level, frame, skipped = 1, sys._getframe(), {"cvtgs", "contextlib", "torch"}
     while frame.f_back and str(frame.f_globals.get("__name__")).partition(".")[0] in skipped:
         level, frame = level + 1, frame.f_back
@@ -173,11 +161,7 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
 
 @contextmanager
 def without_warnings(category: type[Warning] = Warning) -> Iterator[None]:
-    """Issue no warnings of cvtgs of a category in this thread.
-
-    ``warnings.catch_warnings`` changes the filters of the whole process, and leaves them changed if
-    several threads use it at once.
-    """
+    """Issue no warnings of cvtgs of a category in this thread; filters are of the whole process."""
     token = _LEFT_OUT.set((category,))
     try:
         yield
@@ -191,20 +175,15 @@ def reason_of(error: Exception) -> str:
 
 
 def how_to_install(*packages: str) -> str:
-    """Return the end of a message about a missing package: the command that installs it.
-
-    An extra (``cvtgs[view]``) is added to the cvtgs that is installed. The quotes are those that
-    the shells of all systems know.
-    """
+    """Return the end of a message about a missing package: the command that installs it."""
+    # Shells of all systems know these quotes, which brackets of an extra need.
     words = (f'"{package}"' if "[" in package else package for package in packages)
     return f"install it with python -m pip install {' '.join(words)}"
 
 
 def is_out_of_memory(error: BaseException) -> bool:
     """Check whether an error of any library means that there is not enough memory."""
-    if isinstance(error, MemoryError):
-        return True
-    if isinstance(error, OSError) and error.errno == errno.ENOMEM:
+    if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
         return True
     if getattr(error, "winerror", None) in _NO_MEMORY_ON_WINDOWS:
         return True
@@ -245,6 +224,5 @@ def input_errors(path: str | os.PathLike[str]) -> Iterator[None]:
         text = f"{path}: the file to read must exist, found {found}."
         raise InputNotFoundError(text).about(path, errno.ENOENT) from error
     except OSError as error:
-        reason = reason_of(error)
-        text = f"{path}: the file must be readable, found: {reason}."
+        text = f"{path}: the file must be readable, found: {reason_of(error)}."
         raise InputError(text).about(path, error.errno) from error
