@@ -6,7 +6,7 @@ import platform
 import re
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, nullcontext
 from contextvars import ContextVar
@@ -20,21 +20,14 @@ from torch.nn.functional import pad
 from cvtgs.errors import DeviceError, OutOfMemoryError, is_out_of_memory
 from cvtgs.text import shortened
 
-LONGER_CHUNKS = 128
-"""Maximum length of a chunk on other devices, as a multiple of its length on a CPU."""
-
-CHUNK_BYTES = 1 << 29
-"""Device memory to reserve per chunk of CPU length, which takes at most a quarter of it."""
-
+LONGER_CHUNKS = 128  # largest length of a chunk on other devices, in units of that on a CPU
+CHUNK_BYTES = 1 << 29  # device memory per chunk of CPU length, which takes at most a quarter of it
 HOST = torch.device("cpu")
-
 ALIGNMENT = 128  # bytes at which a tensor of a shared copy starts, enough for matrix products
 
 MOST_THREADS = 4
-"""Maximum number of threads that share chunks of torch operations.
-
-An operation on a chunk takes some 50 microseconds, and Python's lock is held for a tenth of the
-time. With more threads, most of them wait for the lock.
+"""Maximum number of threads that share chunks of torch operations; more would mostly wait for
+Python's lock, which is held for a tenth of the 50 microseconds that an operation on a chunk takes.
 """
 
 Item = TypeVar("Item")
@@ -83,11 +76,7 @@ def usable_device(device: str | torch.device) -> torch.device:
 
 
 def chosen_device(device: str | torch.device, home: str | torch.device = "cpu") -> torch.device:
-    """Return the device to compute on.
-
-    ``auto`` is CUDA, if any, for a scene on the CPU, else ``home``, or the CPU if ``home`` has no
-    float64.
-    """
+    """Return the device to compute on; for ``auto``, CUDA for a scene on the CPU, else ``home``."""
     if device != "auto":
         named = usable_device(device)
         check_computes(named)
@@ -145,17 +134,12 @@ def move_together(tensors: Sequence[Tensor], device: torch.device) -> list[Tenso
 
 
 def chunk_length(length: int, device: torch.device) -> int:
-    """Return the length of a chunk on a device, given its length on a CPU.
-
-    A chunk that fits the caches of a CPU is too short for a GPU, where every chunk costs kernel
-    launches; it is 128 times as long there, or less on CUDA devices with less than 64 GiB. The
-    length depends on the total memory of the device, not on its free memory, so that the same
-    device gives the same bits. In the second attempt of :func:`within_memory`, it is that of a CPU.
-    """
+    """Return the length of a chunk on a device, where launches cost time, by that on a CPU."""
     if device.type == "cpu" or _SHORT_CHUNKS.get():
         return length
     if device.type != "cuda":
         return LONGER_CHUNKS * length
+    # Not by the free memory, so that the same device gives the same bits.
     memory = torch.cuda.get_device_properties(device).total_memory
     return max(1, min(LONGER_CHUNKS, memory // CHUNK_BYTES)) * length
 
@@ -175,11 +159,10 @@ def within_memory(
 ) -> Result:
     """Compute on a device; if it runs out of memory, retry with short chunks, then on the CPU.
 
-    ``compute`` takes the device and a note for the report, which is empty in the first attempt.
-    Within another such call, the outer one retries.
+    ``compute`` takes the device and a note for the report, empty in the first attempt.
     """
     note = ""
-    if _SHORT_CHUNKS.get() is not None:
+    if _SHORT_CHUNKS.get() is not None:  # the outer call retries
         return compute(device, note)
     for is_short in (False, True):
         token = _SHORT_CHUNKS.set(is_short)
@@ -219,40 +202,19 @@ def thread_count() -> int:
 
 def in_threads(
     function: Callable[[Item], Result], items: Iterable[Item], device: torch.device
-) -> Iterator[Result]:
-    """Call a function for chunks in as many threads as torch uses, at most ``MOST_THREADS``.
+) -> Generator[Result, None, None]:
+    """Yield the results for chunks, in order, each by one of as many threads as torch uses.
 
-    Chunks are too short for torch to parallelise its operations on them well, so each call uses one
-    thread of torch. Every chunk gives the same bits, whatever the number of threads. On other
-    devices than CPUs, chunks run sequentially. Results come in the order of the items, computed
-    when requested or earlier.
+    Every chunk has one thread of torch, and the same bits; chunks on other devices run in turn.
     """
     with _Limits.lock:
         threads = max(torch.get_num_threads(), _OWN.for_chunks)
         if threads == 1 and _Limits.running > 0 and not _OWN.is_limited:
             threads = _Limits.threads  # another call limits torch at the moment
-    if device.type != "cpu" or threads == 1 or thread_count() == 1:
-        return map(function, items)
-    return _in_pool(function, items, min(threads, thread_count()))
-
-
-def in_chunks(
-    function: Callable[[slice], Result], total: int, length: int, device: torch.device
-) -> list[Result]:
-    """Call a function for consecutive ranges of rows, as :func:`in_threads` does.
-
-    ``length`` is that on a CPU. Without rows, there is one empty range. The calling thread computes
-    a single range, with all threads of torch.
-    """
-    parts = row_chunks(total, length, device) or [slice(0, 0)]
-    if len(parts) == 1:
-        return [function(parts[0])]
-    return list(in_threads(function, parts, device))
-
-
-def _in_pool(
-    function: Callable[[Item], Result], items: Iterable[Item], threads: int
-) -> Iterator[Result]:
+    threads = min(threads, thread_count())
+    if device.type != "cpu" or threads == 1:
+        yield from map(function, items)
+        return
     has_gradients, workers = torch.is_grad_enabled(), min(threads, MOST_THREADS)
     is_inference = torch.is_inference_mode_enabled()
 
@@ -282,15 +244,25 @@ def _in_pool(
                 future.cancel()
 
 
-def _limit_own(before: int) -> None:
-    """Limit torch to one thread in the calling thread alone.
+def in_chunks(
+    function: Callable[[slice], Result], total: int, length: int, device: torch.device
+) -> list[Result]:
+    """Call a function for ranges of rows, at least one, as :func:`in_threads` does.
 
-    Threads of the program that start later take the number that any thread has set last, and keep
-    it; so another thread sets the number again that was in force before.
+    ``length`` is that on a CPU. The calling thread computes a single range, with torch's threads.
     """
+    parts = row_chunks(total, length, device) or [slice(0, 0)]
+    if len(parts) == 1:
+        return [function(parts[0])]
+    return list(in_threads(function, parts, device))
+
+
+def _limit_own(before: int) -> None:
+    """Limit torch to one thread in the calling thread alone."""
     with _Limits.setting:
         torch.get_num_threads()  # or the first operation here would take the number set last
         torch.set_num_threads(1)
+        # Threads that start later take, and keep, the number that any thread has set last.
         if before > 1:
             setter = threading.Thread(target=torch.set_num_threads, args=(before,))
             setter.start()
@@ -318,11 +290,8 @@ def on_host() -> Iterator[None]:
 
 @contextmanager
 def in_float32() -> Iterator[None]:
-    """Create tensors in float32, whatever the default dtype, for a short time.
-
-    It is that of the whole process, so only one thread at a time may change it.
-    """
-    with _Limits.dtype:
+    """Create tensors in float32, whatever the default dtype, for a short time."""
+    with _Limits.dtype:  # the default is that of the whole process
         dtype = torch.get_default_dtype()
         if dtype != torch.float32:
             torch.set_default_dtype(torch.float32)
@@ -335,11 +304,7 @@ def in_float32() -> Iterator[None]:
 
 @contextmanager
 def one_thread() -> Iterator[int]:
-    """Make torch use one thread; yield how many it used before.
-
-    Sums then do not depend on the number of cores, and operations that are too small to parallelise
-    do not wait for threads.
-    """
+    """Make torch use one thread, so that no sum depends on cores; yield how many it used before."""
     if _OWN.is_limited:
         yield _OWN.spare
         return
@@ -364,14 +329,9 @@ def one_thread() -> Iterator[int]:
 
 @contextmanager
 def threads_for_chunks() -> Iterator[None]:
-    """Leave the threads of torch to chunks (:func:`in_threads`) and to compiled loops.
-
-    Each thread of torch takes a part of an operation, and where a part starts changes the last bit
-    of some exponentials and sums; chunks have the same length for any number of threads. After
-    every operation, the threads of torch wait for one another, and spin meanwhile. If other
-    programs use the cores, each wait may last as long as a turn of theirs, some milliseconds, and
-    a call ten times as long as with one thread. Threads for chunks rarely wait.
-    """
+    """Leave the threads of torch to chunks (:func:`in_threads`) and to compiled loops."""
+    # Where torch splits an operation changes last bits, and its threads wait for one another after
+    # each: ten times as long if other programs use the cores. Threads for chunks rarely wait.
     if _OWN.is_limited:
         yield
         return
@@ -386,7 +346,6 @@ def threads_for_chunks() -> Iterator[None]:
 def kernel_threads() -> int:
     """Return the number of threads for loops whose results do not depend on it.
 
-    It is that of torch, or the one that :func:`one_thread` takes from torch; in a thread of
-    :func:`in_threads`, its share of them.
+    In a thread of :func:`in_threads`, it is its share of those that torch leaves.
     """
     return max(torch.get_num_threads(), _OWN.spare)

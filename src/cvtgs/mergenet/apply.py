@@ -27,6 +27,9 @@ flat cell leave its plane by many thicknesses, though its members hardly call fo
 
 _LARGEST = 1e15
 
+Corrected = tuple[Tensor, dict[str, Tensor]]  # numbers of some cells, and their corrected tensors
+Corrections = Generator[Corrected, None, None]
+
 
 def correct_cells(  # noqa: PLR0913 (options by name)
     net: Net,
@@ -131,7 +134,7 @@ def _correct_gated(  # noqa: PLR0913 (options by name)
     visibility: Float[Tensor, "n"],
     sizes: Int[Tensor, "m_all"],
     pixel_size: float,
-) -> Generator[tuple[Int[Tensor, "r"], dict[str, Tensor]], None, None]:
+) -> Corrections:
     """Yield runs of cells and their corrected tensors."""
     if len(visibility) != len(scene):
         raise InvalidArgumentError(
@@ -149,23 +152,15 @@ def _correct_gated(  # noqa: PLR0913 (options by name)
             for run, part in several.cut(block).chunks(chunk, cell_cost=near):
                 yield own[run], context.cut(run), part
 
-    def correct(
-        item: tuple[Tensor, NeighborContext, Partition],
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def correct(item: tuple[Tensor, NeighborContext, Partition]) -> Corrected:
         rows, context, part = item
         descriptors = describe_members(
             scene, part, context=context, visibility=visibility, pixel_size=pixel_size
         )
-        return rows, compose(
-            scene,
-            merged,
-            descriptors.part,
-            cells=rows,
-            neighbors=neighbors[rows],
-            residuals=net(descriptors),
-        )
+        residuals, own, members = net(descriptors), neighbors[rows], descriptors.part
+        return rows, compose(scene, merged, members, cells=rows, neighbors=own, residuals=residuals)
 
-    yield from in_threads(correct, chunks(), scene.device)
+    return in_threads(correct, chunks(), scene.device)
 
 
 def _correct_as_published(
@@ -175,17 +170,17 @@ def _correct_as_published(
     several: Partition,
     *,
     cells: Int[Tensor, "m"],
-) -> Generator[tuple[Int[Tensor, "r"], dict[str, Tensor]], None, None]:
+) -> Corrections:
     """Yield runs of cells and their corrected tensors."""
 
-    def correct(item: tuple[slice, Partition]) -> tuple[Tensor, dict[str, Tensor]]:
+    def correct(item: tuple[slice, Partition]) -> Corrected:
         run, part = item
         rows = cells[run]
         descriptors = describe_published(scene, merged, part, cells=rows)
         return rows, compose_published(merged, cells=rows, residuals=net(descriptors))
 
     chunks = several.chunks(chunk_length(CHUNK_MEMBERS, scene.device))
-    yield from in_threads(correct, chunks, scene.device)
+    return in_threads(correct, chunks, scene.device)
 
 
 def compose(
@@ -263,11 +258,7 @@ def turn_limits(log_scales: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
 def compose_published(
     merged: GaussianScene, *, cells: Int[Tensor, "m"], residuals: PublishedResiduals
 ) -> dict[str, Tensor]:
-    """Correct some merged Gaussians by unlimited residuals.
-
-    Like :func:`compose`, but residuals are added to the SH coefficients of every band. Zero
-    residuals return the merged Gaussians bit for bit. Differentiable in the residuals.
-    """
+    """Correct some merged Gaussians like :func:`compose`, by unlimited residuals, also of SH."""
     rest = merged.shN.shape[1]
     bands = {
         "sh0": merged.sh0.index_select(0, cells) + residuals.d_sh[:, :1],
