@@ -214,12 +214,19 @@ def test_an_unknown_format_version_is_refused(path, version):
     )
 
 
-@pytest.mark.parametrize("info", [None, "", "{}", "[]", '{"preset": "standard", "depth": 3}'])
-def test_a_missing_or_invalid_description_is_refused(path, info):
-    assert (
-        refusal(path, content_of(info=info))
-        == "the checkpoint's description is missing or invalid."
-    )
+@pytest.mark.parametrize(
+    ("info", "found"),
+    [
+        (None, "the value: invalid json: "),
+        ("", "the value: invalid json: "),
+        ("{}", "architecture: field required, found {}; "),
+        ("[]", "the value: holds settings, found []."),
+        ('{"preset": "standard", "depth": 3}', "architecture: field required, found {"),
+    ],
+)
+def test_a_missing_or_invalid_description_is_refused(path, info, found):
+    text = refusal(path, content_of(info=info))
+    assert text.startswith(f"the checkpoint's description is missing or invalid: {found}")
 
 
 def test_an_unknown_preset_is_refused(path):

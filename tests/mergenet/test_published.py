@@ -233,8 +233,9 @@ def test_an_unknown_kind_is_refused_in_one_sentence(tmp_path):
     told = INFO.model_dump_json().replace('"published"', '"graph"')
     info = SimpleNamespace(model_dump_json=lambda: told)
     assert refusal(tmp_path, lively(torch.float32), info) == (
-        "the checkpoint has a different architecture: its kind must be gated or published, "
-        "found 'graph'."
+        "the checkpoint's description is missing or invalid: "
+        "architecture.Architecture.kind: input should be 'gated', found 'graph'; "
+        "architecture.PublishedArchitecture.kind: input should be 'published', found 'graph'."
     )
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from cvtgs.config import PRESETS, SimplifyConfig
-from cvtgs.config.base import Record
+from cvtgs.config.base import Record, explain
 from cvtgs.errors import (
     CheckpointError,
     ConfigError,
@@ -24,7 +24,7 @@ from cvtgs.errors import (
 from cvtgs.io.tensors import pack_tensors, tensors_digest, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet, without_weights
 from cvtgs.mergenet.published import Net, PublishedArchitecture, PublishedMergeNet
-from cvtgs.text import printable, printable_name, short_repr, shown
+from cvtgs.text import printable_name, short_repr, shortened, shown
 
 SHIPPED = ("standard", "paper")
 """Names of the checkpoints that come with the package."""
@@ -52,21 +52,6 @@ class LearnedScene(Record):
     sha256: str = ""
     is_validation: bool = False
     cameras_sha256: str = ""
-
-
-KINDS: dict[str, type[Architecture | PublishedArchitecture]] = {
-    "gated": Architecture,
-    "published": PublishedArchitecture,
-}
-"""Classes of the network architectures by kind."""
-
-
-class _Kind(pydantic.BaseModel):
-    kind: str = "gated"  # files of 0.1 have no kind
-
-
-class _Described(pydantic.BaseModel):
-    architecture: _Kind
 
 
 class CheckpointInfo(Record):
@@ -120,9 +105,6 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
     Args:
         source: ``standard`` or ``paper``, which come with the package, or the path of a file.
 
-    Returns:
-        The checkpoint.
-
     Raises:
         CheckpointError: There is no such file, or it is not a checkpoint, is damaged, or has a
             later format or another architecture.
@@ -137,8 +119,7 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
     path = Path(name)
     if name in SHIPPED:
         path = Path(str(resources.files("cvtgs.mergenet") / "data" / f"{name}.safetensors"))
-    content = _read(path, name)
-    tensors, metadata = _unpack(content, name)
+    tensors, metadata = _unpack(_read(path, name), name)
     info = _parse_info(metadata, name)
     digest = tensors_digest(tensors, metadata["info"])
     if metadata.get("sha256") != digest:
@@ -152,16 +133,9 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
 
 
 def encode_checkpoint(net: Net, info: CheckpointInfo) -> bytes:
-    """Return the bytes of a checkpoint file.
+    """Return the bytes of a safetensors file; the same network and description give the same.
 
-    The same network and description give the same bytes.
-
-    Args:
-        net: The network.
-        info: Its description.
-
-    Returns:
-        The bytes of a safetensors file, to be written with :func:`cvtgs.io.atomic_output`.
+    :func:`cvtgs.io.atomic_output` writes them.
 
     Example:
         >>> info = CheckpointInfo(architecture=Architecture(), preset="standard")
@@ -222,23 +196,18 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
             f"versions up to {FORMAT_VERSION}; update cvtgs."
         )
     try:
-        kind = _Described.model_validate_json(metadata.get("info", "")).architecture.kind
-        if kind not in KINDS:
-            raise CheckpointError(
-                f"{name}: the checkpoint has a different architecture: its kind must be "
-                f"{' or '.join(KINDS)}, found {printable(kind)!r}."
-            )
         info = CheckpointInfo.model_validate_json(metadata.get("info", ""))
     except pydantic.ValidationError as error:
+        found = shortened(explain(error), 200)
         raise CheckpointError(
-            f"{name}: the checkpoint's description is missing or invalid."
+            f"{name}: the checkpoint's description is missing or invalid: {found}"
         ) from error
     if info.preset not in SHIPPED:
         raise CheckpointError(
             f"{name}: the preset of the checkpoint must be one of {', '.join(SHIPPED)}, "
             f"found {shown(info.preset)}."
         )
-    ours, theirs = KINDS[info.architecture.kind](), info.architecture
+    ours, theirs = type(info.architecture)(), info.architecture
     for feature in ("member_features", "pair_features", "cell_features"):
         if getattr(ours, feature, 0) != getattr(theirs, feature, 0):
             raise CheckpointError(
