@@ -4,7 +4,14 @@ import pytest
 import torch
 
 from cvtgs.cvt import device_search, nearest, nearest_neighbors, nearest_site
-from cvtgs.cvt.device_search import Boxes, boxes_of, home_leaves, nearest_in_tiles, split_sites
+from cvtgs.cvt.device_search import (
+    box_corners,
+    boxes_of,
+    home_leaves,
+    nearest_in_tiles,
+    rounded_outwards,
+    split_sites,
+)
 from cvtgs.cvt.nearest import nearest_several
 from pretended_device import pretended_cuda
 
@@ -146,6 +153,14 @@ def test_a_search_on_the_device_stays_there():
         torch.testing.assert_close(squared.cpu().sqrt(), smallest(points, sites, 3))
 
 
+def low(boxes):
+    return boxes.chunk(2, dim=1)[0]
+
+
+def high(boxes):
+    return -boxes.chunk(2, dim=1)[1]
+
+
 @pytest.mark.parametrize("count", [1, 16, 17, 100, 1000])
 def test_leaves_hold_every_site_and_its_home(count):
     sites = cloud(count, 3)
@@ -156,19 +171,19 @@ def test_leaves_hold_every_site_and_its_home(count):
     homes = home_leaves(sites, leaves.splits)
     assert (leaves.rows[homes] == torch.arange(count)[:, None]).any(dim=1).all()
     first, last = boxes_of(leaves.sites)[0], boxes_of(leaves.sites)[-1]
-    assert len(first.low) <= 8
-    assert len(last.low) == len(leaves.rows)
-    assert torch.equal(first.low.amin(0), sites.amin(0))
-    assert torch.equal(last.high.amax(0), sites.amax(0))
+    assert len(low(first)) <= 8
+    assert len(low(last)) == len(leaves.rows)
+    assert torch.equal(low(first).amin(0), sites.amin(0))
+    assert torch.equal(high(last).amax(0), sites.amax(0))
 
 
 def test_boxes_are_rounded_outwards():
     sites = 1e-3 * cloud(4000, 3)
-    boxes = Boxes.around(sites.view(-1, 1, 3))
-    found = boxes.enlarged(torch.tensor(0.1).double())
-    assert found.low.dtype == torch.float32
-    assert (found.low.double() <= boxes.low / torch.tensor(0.1)).all()
-    assert (found.high.double() >= boxes.high / torch.tensor(0.1)).all()
+    boxes = box_corners(sites.view(-1, 1, 3))
+    found = rounded_outwards(boxes, torch.tensor(0.1).double())
+    assert found.dtype == torch.float32
+    assert (low(found).double() <= low(boxes) / torch.tensor(0.1)).all()
+    assert (high(found).double() >= high(boxes) / torch.tensor(0.1)).all()
 
 
 def test_sites_at_one_position_have_neighbours_of_their_own():

@@ -20,12 +20,8 @@ from cvtgs.devices import chunk_length, row_chunks
 
 FAN_BITS = 3  # levels of the tree that are descended at once: a box has eight children
 FARTHEST = 1e37  # limit of coordinates in float32, in units
-
 LEAF = 16  # largest number of sites in a leaf, unless more are wanted for each point
-
-TILE = 32
-"""Points per tile. Larger tiles make longer matrices, but compare each point with more sites."""
-
+TILE = 32  # points per tile: larger ones make longer matrices, but compare points with more sites
 TILES = 1 << 12  # tiles per chunk of the descent, at the chunk length of a CPU
 PAIRS = 1 << 20  # of tiles and boxes, up to which levels of the tree are skipped
 DISTANCES = 1 << 22  # distances per matrix product, at the chunk length of a CPU
@@ -34,46 +30,28 @@ CLOSE = 1e-5
 """Squared distances below this share of the squared reach of a tile are too close for float32,
 which is off by at most some 3e-7 of it; they are computed again in float64."""
 
-FEW = 1 / 16
-"""Groups of tiles of any kind may take this share of the longest: launches would cost more."""
-
+FEW = 1 / 16  # groups of any tiles may take this share of the longest: launches would cost more
 EXACT_COST = 8  # memory of an exact distance, in units of that of a fast one, rounded up
 SLACK = 1 + 1e-5  # bounds grow by this factor, against rounding of gaps between boxes
-
-LEAST_GAP, LARGEST_GAP = 1e-18, 1e17
-"""Limits of gaps in float32, in units of a common search radius."""
+LEAST_GAP, LARGEST_GAP = 1e-18, 1e17  # limits in float32, in units of a common search radius
 
 
-class Boxes(NamedTuple):
-    """Boxes with axes along the coordinates.
+def box_corners(points: Float[Tensor, "k p d"]) -> Float[Tensor, "k two_d"]:
+    """Return the smallest coordinates of groups of points, and the largest ones, negated.
 
-    Their largest coordinates are stored with the opposite sign, so that both are rounded downwards,
-    and a box around others has the smallest of both.
+    So both are rounded downwards, and a box around others has the smallest of both.
     """
+    return torch.cat([points.amin(dim=1), -points.amax(dim=1)], dim=1)
 
-    corners: Float[Tensor, "k two_d"]  # smallest coordinates, and the largest ones, negated
 
-    @property
-    def low(self) -> Float[Tensor, "k d"]:
-        """The smallest coordinates."""
-        return self.corners[:, : self.corners.shape[1] // 2]
-
-    @property
-    def high(self) -> Float[Tensor, "k d"]:
-        """The largest coordinates."""
-        return -self.corners[:, self.corners.shape[1] // 2 :]
-
-    @classmethod
-    def around(cls, points: Float[Tensor, "k p d"]) -> "Boxes":
-        """Return the boxes around groups of points."""
-        return cls(torch.cat([points.amin(dim=1), -points.amax(dim=1)], dim=1))
-
-    def enlarged(self, unit: Float[Tensor, ""]) -> "Boxes":
-        """Return boxes in float32 and in units, rounded outwards."""
-        exact = (self.corners / unit).clamp_(-FARTHEST, FARTHEST)
-        inner = exact.float()
-        below = inner.nextafter(torch.full_like(inner[0], -torch.inf))
-        return Boxes(torch.where(inner > exact, below, inner))
+def rounded_outwards(
+    corners: Float[Tensor, "k two_d"], unit: Float[Tensor, ""]
+) -> Float[Tensor, "k two_d"]:
+    """Return the corners of boxes in float32 and in units, rounded downwards."""
+    exact = (corners / unit).clamp_(-FARTHEST, FARTHEST)
+    inner = exact.float()
+    below = inner.nextafter(torch.full_like(inner[0], -torch.inf))
+    return torch.where(inner > exact, below, inner)
 
 
 class Leaves(NamedTuple):
@@ -124,11 +102,11 @@ def home_leaves(
     return boxes
 
 
-def boxes_of(sites: Float[Tensor, "b s d"]) -> list[Boxes]:
+def boxes_of(sites: Float[Tensor, "b s d"]) -> list[Float[Tensor, "k two_d"]]:
     """Return the boxes of the tree, level by level from few large ones to the leaves."""
-    levels = [Boxes.around(sites)]
-    while len(levels[0].corners) > 1 << FAN_BITS:
-        levels.insert(0, Boxes(levels[0].corners.unflatten(0, (-1, 1 << FAN_BITS)).amin(dim=1)))
+    levels = [box_corners(sites)]
+    while len(levels[0]) > 1 << FAN_BITS:
+        levels.insert(0, levels[0].unflatten(0, (-1, 1 << FAN_BITS)).amin(dim=1))
     return levels
 
 
@@ -137,7 +115,7 @@ class Tiles(NamedTuple):
 
     points: Float[Tensor, "t p d"]  # in the last tile, some occur twice
     bounds: Float[Tensor, "t"]  # squared distance within which every point has its nearest sites
-    boxes: Boxes  # around the points
+    boxes: Float[Tensor, "t two_d"]  # around the points
     first: Int[Tensor, "t"]  # the first leaf that its points lie in
     last: Int[Tensor, "t"]  # the last one
     reach: Float[Tensor, "t"]  # distance from the middle within which all nearest sites lie
@@ -146,11 +124,9 @@ class Tiles(NamedTuple):
 def nearest_in_tiles(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int = 1
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
-    """Find the nearest sites of every point, on the device of both.
+    """Find the nearest sites of every point, but for a percent or less, on the device of both.
 
-    Sites are chosen by distances in float32, relative to the middle of the tile, and by distances
-    in float64 where those are too coarse. Where two sites are equally near but for a percent or
-    less, either may be found.
+    Distances are in float32, relative to the middle of the tile; in float64 if that is too coarse.
     """
     points, sites = points.double(), sites.double()
     found = torch.empty(len(points), count, dtype=torch.int64, device=points.device)
@@ -174,7 +150,7 @@ def _nearest_of_part(
     points: Float[Tensor, "n d"],
     homes: Int[Tensor, "n"],
     leaves: Leaves,
-    boxes: Sequence[Boxes],
+    boxes: Sequence[Tensor],
     count: int,
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
     """Search for points that are sorted by the leaves they lie in; nearest sites in any order."""
@@ -222,8 +198,9 @@ def tiles_of(
     last = len(points) - 1  # the last tile is filled with its own points, backwards
     fill = torch.where(fill > last, 2 * last + 1 - fill, fill).clamp_min(0).view(-1, size)
     points, bounds = points[fill], bounds[fill].amax(dim=1)
-    boxes, own = Boxes.around(points), homes[fill]
-    reach = torch.linalg.vector_norm(boxes.high - boxes.low, dim=1) + bounds.sqrt()
+    boxes, own = box_corners(points), homes[fill]
+    sides = torch.add(*boxes.chunk(2, dim=1))  # negative
+    reach = torch.linalg.vector_norm(sides, dim=1) + bounds.sqrt()
     return Tiles(
         points=points,
         bounds=bounds,
@@ -235,21 +212,19 @@ def tiles_of(
 
 
 def _candidates(
-    tiles: Tiles, levels: Sequence[Boxes]
+    tiles: Tiles, levels: Sequence[Tensor]
 ) -> tuple[Int[Tensor, "p"], Int[Tensor, "t"], Int[Tensor, "t"]]:
-    """Return lists of leaves that may hold a nearest site, and start and length of each tile's.
-
-    Boxes are compared in float32, which halves the memory to read, and so that no pair is lost.
-    """
+    """Return lists of leaves that may hold a nearest site, and start and length of each tile's."""
     device = tiles.points.device
     unit = tiles.bounds.median().sqrt()
     unit = torch.where((unit > 0) & unit.isfinite(), unit, tiles.reach.median())
-    while len(levels) > 1 and len(tiles.points) * len(levels[1].corners) <= PAIRS:
+    while len(levels) > 1 and len(tiles.points) * len(levels[1]) <= PAIRS:
         levels = levels[1:]
-    # Corners of tiles are swapped, so that a sum with those of a box is the gaps on either side.
+    # In float32, which halves the memory to read, and rounded so that no pair is lost. Corners of
+    # tiles are swapped, so that a sum with those of a box is the gaps on either side.
     axes = tiles.points.shape[2]
-    corners = [tiles.boxes.corners.roll(axes, dims=1), *(boxes.corners for boxes in levels)]
-    ours, *theirs = Boxes(torch.cat(corners)).enlarged(unit).corners.split(list(map(len, corners)))
+    corners = [tiles.boxes.roll(axes, dims=1), *levels]
+    ours, *theirs = rounded_outwards(torch.cat(corners), unit).split(list(map(len, corners)))
     bounds = (tiles.bounds / unit.square() * SLACK).clamp(LEAST_GAP**2, 100 * LARGEST_GAP**2)
     bounds = bounds.where(tiles.bounds > 0, 0.0).float()
     tile, ends = torch.arange(len(ours), device=device), torch.stack([tiles.first, tiles.last])
@@ -271,7 +246,7 @@ def _candidates(
 
 
 def _nearest_of_tiles(
-    tiles: Tiles, leaves: Leaves, boxes: Sequence[Boxes], count: int, *, is_exact: bool
+    tiles: Tiles, leaves: Leaves, boxes: Sequence[Tensor], count: int, *, is_exact: bool
 ) -> Int[Tensor, "n k"]:
     """Return places in the leaves of the nearest sites of all points of the tiles, leaf by leaf."""
     near, starts, numbers = _candidates(tiles, boxes)
@@ -311,8 +286,7 @@ def _nearest_of_tiles(
 def _alike(negative: Sequence[int], longest: int) -> list[tuple[slice, int]]:
     """Group entries whose numbers differ by at most a factor of two, or that are few together.
 
-    Entries have descending numbers, given with a minus. ``longest`` is the largest sum of numbers,
-    with padding, in a group of several. The largest number of each group is returned as well.
+    Numbers descend, with a minus; their sum in a group of several, padded, is at most ``longest``.
     """
     groups, done = list[tuple[slice, int]](), 0
     while done < len(negative):
@@ -320,7 +294,7 @@ def _alike(negative: Sequence[int], longest: int) -> list[tuple[slice, int]]:
         alike = bisect_left(negative, -(most // 2), done) - done
         few = min(int(FEW * longest) // most, len(negative) - done)
         step = max(1, min(max(alike, few), longest // most))
-        groups.append((slice(done, done + step), most))
+        groups.append((slice(done, done + step), most))  # and the largest number
         done += step
     return groups
 
@@ -330,13 +304,11 @@ def _fast_distances(
     sites: Float[Tensor, "g c d"],
     none: Bool[Tensor, "g c"],
 ) -> Float[Tensor, "g q c"]:
-    """Return squared distances less those of the points to the middle, in float32.
+    """Return squared distances less those of the points to the middle; infinite without a site.
 
-    Points and sites are relative to the middle, in units of the reach; the factors are -2 times the
-    points, and 1. Distances are infinite where there is no site. Sites beyond the reach come
-    closer, but not within it.
+    Sites are relative to the middle, in units of the reach; factors are -2 times the points, and 1.
     """
-    sites = sites.clamp_(-4.0, 4.0).float()
+    sites = sites.clamp_(-4.0, 4.0).float()  # no site beyond the reach comes within it
     norms = sites.square().sum(2).masked_fill_(none, torch.inf)
     # |s|^2 - 2 p s as one product of longer vectors: adding the norms would read all once more.
     return torch.bmm(factors, torch.cat([sites, norms[:, :, None]], dim=2).mT)
