@@ -9,8 +9,8 @@ import torch
 
 from cvtgs import Simplifier, concatenate, load, save
 from cvtgs.analysis import analyze
-from cvtgs.analysis.effects import far_visibility
 from cvtgs.cells import Moments, merge_pairs
+from cvtgs.cells.allocate import far_visibility
 from cvtgs.config import AllocationConfig, SimplifyConfig
 from cvtgs.grouping import FULL_GAIN, allocation_at
 from cvtgs.outofcore import simplify_file

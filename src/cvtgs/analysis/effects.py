@@ -18,22 +18,13 @@ from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0, clamped_parts
 from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 from cvtgs.tags import ANTIALIASED, TWO_SCALES
 
-BAND_LOSS = 1e-5
-"""Bands of the spherical harmonics that together change no colour by more are dropped."""
-
+BAND_LOSS = 1e-5  # bands of spherical harmonics that together change no colour by more are dropped
 UNBOUNDED_SHARE = 0.05  # a scene with more than this share of its mass far away is unbounded
-
-FULLY_UNBOUNDED_SHARE = 0.1
-"""From this share on, contraction has full strength; in between it sets in gradually."""
-
-DUPLICATE_SHARE = 0.01
-"""With more than this share of duplicates, it pays to search only once per position."""
-
+FULLY_UNBOUNDED_SHARE = 0.1  # from this share on, contraction, which sets in gradually, is full
+DUPLICATE_SHARE = 0.01  # with more duplicates, it pays to search only once per position
 CLAMPED = 2e-3  # if colours below zero take less of full brightness, 0.02 dB can be gained
 UNBOUNDED_DISTANCE = 3.0  # distance beyond which Gaussians count as far away, in robust radii
-SAMPLE = 1 << 14
-"""Approximate size of samples: of bands, which are examined first, and of colours below zero."""
-
+SAMPLE = 1 << 14  # size of samples: of bands, which are examined first, and of colours below zero
 HASHED = 1 << 12  # smallest expected size of the sample in which duplicates are counted
 CHUNK = 1 << 14
 LEAST_CONTRAST = 1e-6  # floor of the contrast, for scenes of a single colour
@@ -148,46 +139,29 @@ def plan_effects(
         duplicate_share(scene.means, scene.sh0),
         mean_clamped(scene, masses),
     ]
-    figures = torch.stack(shares).tolist()  # one synchronization with the device
-    far, hazy, duplicates, clamped = figures
+    far, hazy, duplicates, clamped = torch.stack(shares).tolist()  # one wait for the device
+    is_double = "of the Gaussians coincide with others of the same colour"
+    is_far = f"of the mass is beyond {UNBOUNDED_DISTANCE:g} robust radii"
+    effects = {
+        name: _decide(figure, getattr(choices, name), what, least=least)
+        for name, figure, what, least in (
+            ("mip", scene.antialiased, "the comment SplatRenderMode: mip is present (1)", 0.0),
+            ("unbounded", far, is_far, UNBOUNDED_SHARE),
+            ("flat", scene.has_two_scales, "the file has two scales per Gaussian (1)", 0.0),
+            ("duplicates", duplicates, is_double, DUPLICATE_SHARE),
+            ("clamping", clamped, "of full brightness, on average, is below zero", CLAMPED),
+            ("extras", len(scene.extras), "there are columns beyond the standard ones", 0.0),
+            ("visibility", config.visibility.views, "the preset asks for images", 0.0),
+        )
+    }
     above = (far - UNBOUNDED_SHARE) / (FULLY_UNBOUNDED_SHARE - UNBOUNDED_SHARE)
-    unbounded = _decide(
-        far,
-        choices.unbounded,
-        f"of the mass is beyond {UNBOUNDED_DISTANCE:g} robust radii",
-        least=UNBOUNDED_SHARE,
-    )
+    unbounded = effects.pop("unbounded")
+    strength = min(1.0, max(0.0, above)) if unbounded.active else 0.0
     return EffectPlan(
         sh=_plan_bands(scene, choices.sh),
-        mip=_decide(
-            scene.antialiased, choices.mip, "the comment SplatRenderMode: mip is present (1)"
-        ),
-        unbounded=GradedEffect(
-            **unbounded.model_dump(),
-            strength=min(1.0, max(0.0, above)) if unbounded.active else 0.0,
-        ),
+        unbounded=GradedEffect(**unbounded.model_dump(), strength=strength),
         haze=plan_haze(hazy, config),
-        flat=_decide(
-            scene.has_two_scales, choices.flat, "the file has two scales per Gaussian (1)"
-        ),
-        duplicates=_decide(
-            duplicates,
-            choices.duplicates,
-            "of the Gaussians coincide with others of the same colour",
-            least=DUPLICATE_SHARE,
-        ),
-        clamping=_decide(
-            clamped,
-            choices.clamping,
-            "of full brightness, on average, is below zero",
-            least=CLAMPED,
-        ),
-        extras=_decide(
-            len(scene.extras), choices.extras, "there are columns beyond the standard ones"
-        ),
-        visibility=_decide(
-            config.visibility.views, choices.visibility, "the preset asks for images"
-        ),
+        **effects,
     )
 
 
@@ -248,11 +222,7 @@ def _decide(figure: float, choice: str, what: str, *, least: float = 0.0) -> Eff
 def band_losses(scene: GaussianScene, *, enough: float) -> tuple[float, ...]:
     """Return the largest change of a colour by dropping each band of the spherical harmonics.
 
-    A pixel mixes colours with weights that sum to at most 1, so no pixel changes by more. By
-    the addition theorem (Unsöld 1927), a band of degree l with coefficients c changes a channel
-    by at most ``sqrt((2 l + 1) / (4 pi) sum c^2)``; here the sum is over all channels. This bound
-    is divided by the opacity-weighted standard deviation of the constant colours, if that is below
-    1.
+    It is a bound, in units of the standard deviation of constant colours if that is below 1.
     """
     losses = [0.0] * scene.sh_degree
     if not losses:
@@ -271,7 +241,7 @@ def band_losses(scene: GaussianScene, *, enough: float) -> tuple[float, ...]:
             figures.append(torch.nn.functional.pad(sums, (0, 1)).amax().double())
         deviation, *squares = torch.stack(figures).tolist()
         unit = min(1.0, max(deviation, LEAST_CONTRAST))
-        for band, square in enumerate(squares):
+        for band, square in enumerate(squares):  # by the addition theorem (Unsöld 1927)
             change = math.sqrt((2 * band + 3) / (4 * math.pi) * square)
             losses[band] = max(losses[band], change / unit)
         if losses[-1] >= enough:
@@ -284,41 +254,17 @@ def far_share(distances: Float[Tensor, "n"], masses: Float[Tensor, "n"]) -> Floa
     return divide((masses * (distances > UNBOUNDED_DISTANCE)).sum(), masses.sum()).double()
 
 
-def far_visibility(share: float, area: float) -> float:
-    """Return how much of the far mass is visible, relative to how much of the near mass is.
-
-    Mass hides mass behind it: ``(1 - exp(-x)) / x`` of ``x`` layers is visible. Far mass lies
-    around the scene, near mass on a disc of one robust radius.
-
-    Args:
-        share: Share of far mass.
-        area: All mass, in squared robust radii.
-    """
-    area = min(area, 1e30)
-    layers = area * share / (4.0 * math.pi), area * (1.0 - share) / math.pi
-    far, near = (-math.expm1(-x) / x if x > 0.0 else 1.0 for x in layers)
-    return far / near
-
-
 def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) -> Float[Tensor, ""]:
-    """Return the share of Gaussians that repeat exactly the position and colour of another.
-
-    For large scenes it is estimated from a sample, which is chosen by a hash of the position, so
-    that duplicates are sampled together. A crowd at one position counts wholly or not at all.
-    """
-    sample = hashed_rows(means, HASHED)
+    """Return the share of Gaussians that repeat exactly the position and colour of another."""
+    sample = hashed_rows(means, HASHED)  # by positions, so that duplicates are sampled together
     place, color = means[sample], sh0[sample, 0]
     same = (place[1:] == place[:-1]).all(dim=1) & (color[1:] == color[:-1]).all(dim=1)
     return same.sum().double() / max(1, len(sample))
 
 
 def mean_clamped(scene: GaussianScene, masses: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Return how far colours are below zero, as a mean over a sample, by mass, and directions.
-
-    The sample does not depend on the order of the rows, and is large: a few heavy Gaussians may
-    hold most of the mass.
-    """
-    sample = hashed_rows(scene.means, SAMPLE)
+    """Return how far colours are below zero, as a mean over a sample, by mass, and directions."""
+    sample = hashed_rows(scene.means, SAMPLE)  # large, as a few Gaussians may hold most of the mass
     clamped = SH_C0 * clamped_parts(scene.sh0[sample], scene.shN[sample])[:, 0].mean(dim=1)
     weights = masses[sample].double()
     return divide((weights * clamped).sum(), weights.sum())

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.analysis.effects import far_share, far_visibility
+from cvtgs.analysis.effects import far_share
 from cvtgs.cells.moments import UPPER, Moments, join_pairs, joint_covariances, take_moments
 from cvtgs.checks import checked
 from cvtgs.config import AllocationConfig
@@ -22,16 +22,13 @@ from cvtgs.math.segments import label_argmin, take_columns
 
 CHUNK = 1 << 15  # Gaussians per chunk of the cost computation, to bound memory
 
-SHARE_PER_ROUND = 0.35
-"""Largest number of pairs merged before costs are recomputed, as a share of the cells."""
+SHARE_PER_ROUND = 0.35  # of the cells: most pairs merged before costs are recomputed
 
 THICKNESS = 0.01
 """The cost of a pair adds this share of the sum of variances to each, so that the thickness of
 flat Gaussians, which images hardly show, counts less than their extent."""
 
-FLOOR = 1e-4
-"""Standard deviation, in robust radii, added in quadrature so that flat shapes have a volume."""
-
+FLOOR = 1e-4  # standard deviation, in robust radii, that gives flat shapes a volume
 COMMON_CONTRAST = 0.2  # of neighbours, in units of RGB, for which weights of costs are given
 LEAST_CONTRAST, LARGEST_CONTRAST = 0.3, 1.4  # limits in weights, in units of the common one
 MOSTLY_FAR = 0.3  # share of far mass from which on the limit of heavy pairs applies in full
@@ -40,9 +37,7 @@ VIEWERS = 3.0  # distance from the middle of the scene, in robust radii, from wh
 LEAST_VISIBLE, MOST_VISIBLE = 1.5, 2.5
 """Far mass this many times as visible as near mass begins to count more; counts most."""
 
-SAMPLE = 1 << 16
-"""Number of groups from which on only some of them are used to measure the contrast."""
-
+SAMPLE = 1 << 16  # number of groups from which on only some of them show the contrast
 MOST_ROUNDS = 30  # number of vectorised rounds that choose disjoint pairs; captures need 6 to 11
 ROW_BITS, LAST_ROW = 32, (1 << 32) - 1  # keys to sort by have a row number in their lower bits
 
@@ -146,11 +141,20 @@ def _far_gain(share: float, area: float | None, config: AllocationConfig) -> flo
     return float(config.far_gain**strength)
 
 
-def _relative_contrast(colors: Float[Tensor, "3 m"], neighbors: Int[Tensor, "m k"]) -> float:
-    """Return the contrast of neighbours in units of a common one, within limits.
+def far_visibility(share: float, area: float) -> float:
+    """Return how much of the far mass is visible, relative to how much of the near mass is.
 
-    The contrast is the root of half the mean squared difference of their colours, in a sample.
+    ``share`` is that of far mass, ``area`` is all mass, squared robust radii.
     """
+    area = min(area, 1e30)
+    # Far mass lies around the scene, near mass on a disc of one robust radius.
+    layers = area * share / (4.0 * math.pi), area * (1.0 - share) / math.pi
+    far, near = (-math.expm1(-x) / x if x > 0.0 else 1.0 for x in layers)  # mass hides mass
+    return far / near
+
+
+def _relative_contrast(colors: Float[Tensor, "3 m"], neighbors: Int[Tensor, "m k"]) -> float:
+    """Return the contrast of the colours of neighbours in units of a common one, within limits."""
     rows = torch.arange(0, len(neighbors), 1 + len(neighbors) // SAMPLE, device=colors.device)
     near = neighbors.index_select(0, rows)
     steps = (colors[:, near] - colors.index_select(1, rows)[:, :, None]).cpu().numpy()
@@ -160,10 +164,7 @@ def _relative_contrast(colors: Float[Tensor, "3 m"], neighbors: Int[Tensor, "m k
 
 
 def _distinct_pairs(first: Tensor, second: Tensor) -> Int[Tensor, "q"]:
-    """Return a key of each unordered pair of different groups, ascending.
-
-    The upper bits of a key are the smaller of the two groups, the lower ones the other.
-    """
+    """Return keys of pairs of different groups, ascending: the smaller group in upper bits."""
 
     def keys_of(part: slice) -> Tensor:
         one, two = first[part], second[part]
@@ -215,11 +216,8 @@ def _pair_costs(
 def _fog_factor(
     covariances: Float[Tensor, "6 n"], means: Float[Tensor, "3 n"], widest: float
 ) -> Float[Tensor, "n"]:
-    """Return factors that grow where a Gaussian is wide for its distance from viewers.
-
-    A camera sees part of such a Gaussian even if its centre is far outside of the image. There its
-    projection is spread over the whole image, and drawn before what lies behind its centre.
-    """
+    """Return factors that grow where a Gaussian is wide for its distance from viewers."""
+    # Cameras see such Gaussians spread over the image, even if the centre is far outside of it.
     xx, _, _, yy, _, zz = covariances
     width = (xx + yy + zz) / (means.square().sum(0) + VIEWERS**2)
     factors: Tensor = 1.0 + (width / widest**2).square().square()
@@ -246,10 +244,7 @@ def _cheapest_disjoint(
 ) -> tuple[Int[Tensor, "k"], Int[Tensor, "k"]]:
     """Take disjoint pairs, cheapest first, at most ``wanted``; return them in the order of pairs.
 
-    Each round takes every pair that is the cheapest of both its groups. The result is that of a
-    greedy pass over all pairs by cost (Preis 1999), in a few vectorised rounds. Pairs that cost
-    more than ``wanted`` taken ones do not matter. Along chains of ascending costs there would be as
-    many rounds as pairs, so a loop finishes what is left.
+    A greedy pass over all pairs by cost (Preis 1999), in a few vectorised rounds.
     """
     # Bits of positive floats are in the order of the floats, so these keys are in that of costs.
     keys = costs.view(torch.int32).long()
@@ -260,19 +255,21 @@ def _cheapest_disjoint(
     for _ in range(MOST_ROUNDS):
         least = torch.full((total,), torch.iinfo(torch.int64).max, device=keys.device)
         least.scatter_reduce_(0, i, keys, "amin").scatter_reduce_(0, j, keys, "amin")
+        # Every pair that is the cheapest of both its groups is taken.
         is_cheapest = (least.index_select(0, i) == keys) & (least.index_select(0, j) == keys)
         chosen = is_cheapest.nonzero()[:, 0]
         taken.append(keys.index_select(0, chosen))
         is_free.index_fill_(0, i.index_select(0, chosen), False)
         is_free.index_fill_(0, j.index_select(0, chosen), False)
         is_left = is_free.index_select(0, i) & is_free.index_select(0, j)
-        if count < wanted <= count + len(chosen):
+        if count < wanted <= count + len(chosen):  # costlier pairs do not matter
             is_left &= keys < torch.sort(torch.cat(taken)).values[wanted - 1]
         count += len(chosen)
         left = is_left.nonzero()[:, 0]
         i, j, keys = i.index_select(0, left), j.index_select(0, left), keys.index_select(0, left)
         if len(keys) == 0:
             break
+    # Along chains of ascending costs, there would be as many rounds as pairs.
     taken.append(_greedy_pass(i, j, keys, is_free))
     found = torch.sort(torch.cat(taken)).values
     rows = torch.sort(found[:wanted] & LAST_ROW).values
