@@ -24,12 +24,8 @@ MEMBERS_PER_CELL = 4  # if cells would have fewer Gaussians on average, the tess
 REASSIGN = 7  # number of neighbouring cells that a Gaussian may move to
 COLOR_CELLS = 10_000  # the number of cells at which ``cvt.color`` applies unchanged
 
-FULL_RELIEF = 0.1
-"""Ratio of cells to Gaussians from which on ``allocation.far_relief`` applies unchanged."""
-
-FULL_GAIN = 0.4
-"""Strength of the effect unbounded from which on ``allocation.far_gain`` applies unchanged."""
-
+FULL_RELIEF = 0.1  # ratio of cells to Gaussians from which on ``far_relief`` applies unchanged
+FULL_GAIN = 0.4  # strength of the effect unbounded from which on ``far_gain`` applies unchanged
 NEAR = 6  # number of neighbouring cells whose errors count, by half, for a cell
 SMALL_ERROR = 0.02  # share of the mean error that is added to those of all cells
 LARGEST_FACTOR = 12.0  # limit of the factors on masses, and of their inverse
@@ -77,18 +73,7 @@ def weigh_rows(
     *,
     ordered: OrderedRows | None = None,
 ) -> WeightedRows:
-    """Sort Gaussians along the Morton curve, and compute their weights.
-
-    Args:
-        scene: The Gaussians.
-        rows: Rows that passed the filter.
-        analysis: Frame and apparent areas.
-        config: The configuration; ``cvt`` is used.
-        ordered: Cached result of :func:`order_rows`, returned unless its rows differ.
-
-    Returns:
-        The Gaussians to group.
-    """
+    """Sort Gaussians along the Morton curve, and compute their weights, unless they are ordered."""
     if ordered is not None and torch.equal(ordered.filtered, rows):
         return ordered.points
     # Advanced indexing (`values[rows]`) takes three to five times as long as `index_select`.
@@ -121,18 +106,15 @@ def importance_by_errors(
     count: int,
     power: float,
 ) -> Float[Tensor, "n"]:
-    """Return factors on the masses in the costs of merging: larger where cells have larger errors.
+    """Return factors on the masses of ``count`` Gaussians in the costs of merging.
 
-    The errors of neighbouring cells count by half, since errors are also caused by what a cell does
-    not cover. Cells that images hardly show have factors near 1. ``errors`` are squared, ``pixels``
-    is the contribution of each cell to the images, and ``count`` the size of the full scene, whose
-    Gaussians in no cell have factor 1.
+    They are larger where ``errors``, squared ones, of cells that show in ``pixels`` are larger.
     """
     near = cvt.nearest_neighbors(small.means, NEAR)
     errors = errors.nan_to_num(0.0, 0.0, 0.0)  # images of extreme scenes overflow
-    errors = errors + 0.5 * errors[near].sum(dim=1)
+    errors = errors + 0.5 * errors[near].sum(dim=1)  # also caused by what a cell does not cover
     logs = (errors + SMALL_ERROR * errors.mean()).clamp_min(1e-300).log()
-    seen = pixels.double() / (pixels + 1.0)
+    seen = pixels.double() / (pixels + 1.0)  # near 0 for cells that images hardly show
     logs = logs - (seen * logs).sum() / seen.sum().clamp_min(1e-300)
     factors = (power * seen * logs).exp().clamp(1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
     found = factors.new_ones(count)
@@ -148,20 +130,9 @@ def tessellate_rows(
     *,
     on_iteration: Callable[[int], None] = lambda done: None,
 ) -> cvt.Tessellation:
-    """Tessellate Gaussians into cells, more of them than are wanted if pairs of cells will merge.
+    """Tessellate Gaussians into cells, more than ``target`` if pairs of cells will merge.
 
-    Args:
-        points: The Gaussians.
-        analysis: Frame and effect plan.
-        target: Number of cells in the end, at most k.
-        config: The configuration; ``cvt``, ``allocation`` and ``seed`` are used.
-        on_iteration: Called with the number of finished Lloyd iterations.
-
-    Returns:
-        The tessellation.
-
-    Raises:
-        InvalidArgumentError: ``target`` is no whole number from 1 to k.
+    ``on_iteration`` is called with the number of finished Lloyd iterations.
     """
     scene, rows = points.scene, points.rows
     target = checked_whole(target, "target", most=len(rows), things="Gaussians")
@@ -190,15 +161,7 @@ def allocate(
 ) -> Int[Tensor, "k"]:
     """Merge cells in pairs down to the target count, and move members to the cell that fits best.
 
-    Args:
-        points: The Gaussians.
-        tessellation: Their cells, none empty; cell ``i`` is Gaussian ``i`` if there are as many.
-        analysis: Frame, in whose units costs are.
-        target: Number of cells to keep.
-        config: Weights of the costs.
-
-    Returns:
-        The new cell of each Gaussian; no cell is empty.
+    No cell is empty, before and after; cell ``i`` is Gaussian ``i`` if there are as many.
     """
     labels, count = tessellation.labels, len(tessellation.sites)
     is_own = count == len(labels)
@@ -225,16 +188,7 @@ def allocate(
 
 
 def collect_cells(points: WeightedRows, labels: Int[Tensor, "k"], target: int) -> cells.Partition:
-    """Collect the Gaussians of the full scene that make up every cell.
-
-    Args:
-        points: The Gaussians that were grouped.
-        labels: Their cells, none empty.
-        target: Number of cells.
-
-    Returns:
-        Rows of the scene that make up every cell.
-    """
+    """Collect the Gaussians of the full scene that make up every cell, none of them empty."""
     local = cells.Partition.from_labels(labels, target)
     return replace(local, order=points.rows.index_select(0, local.order))
 
@@ -257,13 +211,11 @@ def row_moments(
 
 
 def finer_count(target: int, available: int, config: AllocationConfig) -> int:
-    """Return the number of cells of the tessellation, before pairs of cells merge.
-
-    If its cells would have few members, merging starts from single Gaussians, all ``available``.
-    """
+    """Return the number of cells of the tessellation, before pairs of cells merge."""
     if config.oversampling == 1.0:
         return target
     count = math.ceil(config.oversampling * target)
+    # Merging starts from single Gaussians if cells would have few members.
     return available if count * MEMBERS_PER_CELL > available else count
 
 
@@ -285,10 +237,8 @@ def allocation_at(ratio: float, config: AllocationConfig, *, unbounded: float) -
 def curve_order(
     scene: GaussianScene, rows: Int[Tensor, "k"], frame: RobustFrame, *, masses: Float[Tensor, "k"]
 ) -> Int[Tensor, "k"]:
-    """Return the order of Gaussians along a Morton curve, ties by mass.
-
-    The curve runs through contracted space, so that flyaways do not coarsen it near the middle.
-    """
+    """Return the order of Gaussians along a Morton curve, ties by mass."""
+    # Contracted, so that flyaways do not coarsen the curve near the middle.
     points = cvt.embed(scene.means.index_select(0, rows), frame=frame, contraction=1.0)
     return morton_order(points, ties=masses)
 
@@ -318,15 +268,7 @@ def order_rows(
     """Compute the part of grouping that does not depend on the number of cells, for reuse.
 
     :func:`weigh_rows` uses it only if the filter leaves enough rows for its target; otherwise the
-    filter brings some rows back, and this part is computed again.
-
-    Args:
-        scene: The Gaussians.
-        analysis: Frame, apparent areas and effect plan.
-        config: Filter and weights.
-
-    Returns:
-        The argument ``ordered`` of :func:`weigh_rows`; at most 256 bytes per Gaussian.
+    filter brings some rows back, and this part is computed again. At most 256 bytes per Gaussian.
     """
     rows = filter_rows(scene, analysis, 1, config.filter).rows
     points = weigh_rows(scene, rows, analysis, config)

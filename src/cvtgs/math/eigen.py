@@ -6,34 +6,30 @@ from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError
 
-SWEEPS = 5
-"""Rotations of all three planes. In float64, four leave only rounding errors; one is spare."""
+SWEEPS = 5  # rotations of all three planes; in float64, four leave only rounding errors
 
 
 def symmetric_eigen(
     matrices: Float[Tensor, "n 3 3"],
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Return eigenvalues and eigenvectors of symmetric matrices, as ``torch.linalg.eigh`` does.
-
-    That function fails on CUDA with some ten thousand matrices (torch 2.11 with cuSOLVER 12 asks
-    for half a megabyte for each). There, Jacobi rotations (1846) diagonalise all matrices at once.
-    """
-    if matrices.device.type != "cuda":
-        try:
-            values, axes = torch.linalg.eigh(matrices)
-        except torch.linalg.LinAlgError:  # type: ignore[attr-defined]  # for NaN
-            raise InvalidArgumentError(
-                "covariances must be finite, found NaN or infinity; cvtgs.validity.check_rows "
-                "removes Gaussians with such values."
-            ) from None
-        return values, axes
-    return jacobi_eigen(matrices)
+    """Return eigenvalues and eigenvectors of symmetric matrices, as ``torch.linalg.eigh`` does."""
+    # On CUDA, that fails with some ten thousand matrices: cuSOLVER 12 asks for half a MB for each.
+    if matrices.device.type == "cuda":
+        return jacobi_eigen(matrices)
+    try:
+        values, axes = torch.linalg.eigh(matrices)
+    except torch.linalg.LinAlgError:  # type: ignore[attr-defined]  # for NaN
+        raise InvalidArgumentError(
+            "covariances must be finite, found NaN or infinity; cvtgs.validity.check_rows "
+            "removes Gaussians with such values."
+        ) from None
+    return values, axes
 
 
 def jacobi_eigen(
     matrices: Float[Tensor, "n 3 3"],
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Return what :func:`symmetric_eigen` does, by Jacobi rotations on any device."""
+    """Return what :func:`symmetric_eigen` does, by rotations (Jacobi 1846) of all matrices."""
     diagonal = matrices.diagonal(dim1=1, dim2=2).T.clone(memory_format=torch.contiguous_format)
     # Of each axis, twice the entry that the other two have in common, and its components.
     others = torch.stack([matrices[:, 2, 1], matrices[:, 2, 0], matrices[:, 1, 0]])
@@ -49,11 +45,9 @@ def jacobi_eigen(
 
 
 def _rotate(diagonal: Tensor, axes: Tensor, twice: Tensor, one: Tensor, signs: Tensor) -> None:
-    """Rotate two axes so that their common entry becomes 0 (Golub and Van Loan 2013, 8.5.2).
+    """Rotate two axes, in place, so that ``twice`` their common entry is 0 (Golub 2013, 8.5.2).
 
-    All are changed in place: the two diagonal entries, the axes, before each of which stands twice
-    the entry of the other one and the third, and ``twice`` the common entry. Those entries turn in
-    the opposite direction to the axes; ``signs`` are those of the tangent for all.
+    Before each axis stands twice the entry of the other and the third, which turns by ``signs``.
     """
     step = diagonal[1] - diagonal[0]
     length = torch.hypot(step, twice).clamp_min_(torch.finfo(step.dtype).tiny)

@@ -46,39 +46,18 @@ class RobustFrame:
         return min(self.radius, self.group_radius)
 
     def normalize(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Express points relative to the centre, in radii.
-
-        Args:
-            points: Finite positions, scene units.
-
-        Returns:
-            Positions in float64.
-        """
+        """Express finite points, scene units, relative to the centre, in radii and float64."""
         return (points.double() - self.center) / self.radius
 
     def far_origin(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "3"] | None:
-        """Return the centre if float32 points lie so far from the origin that they are coarse.
-
-        Args:
-            points: Positions, scene units.
-
-        Returns:
-            The centre as float32; None for other points. Differences of points from it are exact
-            where a coordinate is within a factor of two of the centre's (Sterbenz' lemma).
-        """
+        """Return the centre if float32 points lie so far from the origin that they are coarse."""
+        # Differences from it are exact within a factor of two of the centre's (Sterbenz' lemma).
         if points.dtype != torch.float32 or float(self.center.abs().amax()) < FAR * self.radius:
             return None
         return self.center.to(points.dtype)
 
     def distances(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Return distances to the centre, in radii.
-
-        Args:
-            points: Finite positions, scene units.
-
-        Returns:
-            Distances in float64.
-        """
+        """Return distances of finite points, scene units, to the centre, in radii and float64."""
         found = torch.empty(len(points), dtype=torch.float64, device=points.device)
         for part in row_chunks(len(points), CHUNK, points.device):
             found[part] = torch.linalg.vector_norm(self.normalize(points[part]), dim=1)
@@ -90,15 +69,7 @@ class RobustFrame:
         A point at distance d > 1 moves to distance ``1 + log(d)`` in the same direction. Steps
         along the view from the middle shrink by ``1/d`` and those across it by ``(1 + log(d))/d``,
         so a far cell nearly keeps its shape; the map ``2 - 1/d`` of mip-NeRF 360 (Barron et al.
-        2022) flattens it.
-
-        Args:
-            points: Finite positions, scene units.
-            strength: From 0 (no contraction) to 1. In between, the change of the logarithm of the
-                distance is scaled by this factor.
-
-        Returns:
-            Positions in float64; with strength 1, a flyaway at 1e30 radii moves to 70.
+        2022) flattens it. A strength below 1 scales the change of the logarithm of the distance.
         """
         local = self.normalize(points)
         distance: Tensor = torch.linalg.vector_norm(local, dim=1, keepdim=True).clamp_min(1.0)
@@ -106,14 +77,10 @@ class RobustFrame:
 
 
 def robust_frame(points: Float[Tensor, "n 3"]) -> RobustFrame:
-    """Find the robust frame of points.
+    """Find the robust frame of finite positions, at least one.
 
-    Args:
-        points: Finite positions, at least one.
-
-    Returns:
-        The frame. If more than 70 % of the points coincide, the radius is the 70 % quantile of the
-        distances of the others; if all do, it is 1.
+    If more than 70 % of them coincide, the radius is the 70 % quantile of the distances of the
+    others; if all do, it is 1.
 
     Example:
         >>> frame = robust_frame(torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
@@ -127,18 +94,12 @@ def robust_frame(points: Float[Tensor, "n 3"]) -> RobustFrame:
 
 
 def group_radius(points: Float[Tensor, "n 3"]) -> float:
-    """Estimate the radius of the groups that points consist of, as a person would look at them.
+    """Estimate the radius of the groups that finite points consist of, as a person would see them.
 
     It is seven times the median, over a sample that is the same in any order of the rows, of the
-    distance within which a point has a twentieth of all. This is 1.1 to 3.3 robust radii in scenes
-    of one group, and about three radii of a group where two or more are much further apart than
-    they are wide.
-
-    Args:
-        points: Finite positions.
-
-    Returns:
-        The radius; infinite for fewer than 512 points, and where many coincide.
+    distance within which a point has a twentieth of all: 1.1 to 3.3 robust radii in scenes of one
+    group, and about three radii of a group where two or more are much further apart than wide. It
+    is infinite for fewer than 512 points, and where many coincide.
     """
     if len(points) < GROUPED:
         return math.inf
@@ -160,16 +121,10 @@ def _radius(distances: Float[Tensor, "n"]) -> float:
 
 
 def unit_vectors(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Scale vectors to unit length.
+    """Scale finite vectors other than 0 to unit length.
 
     A power of two is divided out first, so that the squares of tiny and huge ones stay finite and
     above 0, and all others have the same bits as without.
-
-    Args:
-        vectors: Finite vectors other than 0.
-
-    Returns:
-        Vectors of the same direction.
 
     Example:
         >>> unit_vectors(torch.tensor([[0.0, 0.0, 1e-30]])).tolist()
@@ -184,13 +139,8 @@ def morton_order(
 ) -> Int[Tensor, "n"]:
     """Order points along a Morton curve through their bounding cube (Morton 1966).
 
-    Args:
-        points: Finite positions, best without far outliers (2^21 steps span the cube).
-        ties: Values that order points of the same code, ascending, independently of the order of
-            the rows.
-
-    Returns:
-        Row numbers; points with equal code and ties keep their order.
+    Far outliers make it coarse: 2^21 steps span the cube. ``ties`` order points of the same code,
+    ascending, independently of the order of the rows; else these keep their order.
 
     Example:
         >>> morton_order(torch.tensor([[1.0, 1, 1], [0, 0, 0], [1, 0, 0]])).tolist()
@@ -226,12 +176,7 @@ def _spread_bits(values: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
 def hashed_rows(means: Float[Tensor, "n 3"], least: int) -> Int[Tensor, "s"]:
     """Sample rows in an order that only depends on the positions: that of their hashes.
 
-    Args:
-        means: Positions.
-        least: Least number of rows to expect; the sample has up to twice as many, or all rows.
-
-    Returns:
-        Rows; of coincident points, all or none.
+    The sample has from ``least`` to twice as many rows, or all; of coincident points, all or none.
     """
     bits = max(0, math.floor(math.log2(max(1, len(means)) / least)))
     rows, hashes = [], []
@@ -244,12 +189,9 @@ def hashed_rows(means: Float[Tensor, "n 3"], least: int) -> Int[Tensor, "s"]:
 
 
 def _hash(means: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
-    """Hash positions; equal positions give equal hashes, which may be negative.
-
-    Rounded coordinates end with many zero bits, so upper bits must reach the lower ones.
-    """
+    """Hash positions; equal positions give equal hashes, which may be negative."""
     whole = torch.int32 if means.dtype == torch.float32 else torch.int64
     bits = (means + 0.0).contiguous().view(whole).long()  # no -0.0
-    x, y, z = (bits ^ (bits >> 32)).unbind(1)
+    x, y, z = (bits ^ (bits >> 32)).unbind(1)  # lower bits of rounded coordinates are zeros
     mixed = x * _FACTORS[0] + y * _FACTORS[1] + z * _FACTORS[2]  # wraps round
     return (mixed ^ (mixed >> 32)) * _FACTORS[0] >> 16

@@ -25,13 +25,7 @@ AREA_EXPONENT = 1.6075
 
 
 def opacity_from_logit(logits: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Activate opacity logits.
-
-    Args:
-        logits: Stored opacities, any shape, any real number or infinity.
-
-    Returns:
-        Opacities in [1e-6, 1 - 1e-6].
+    """Activate opacity logits, any numbers or infinity, to opacities in [1e-6, 1 - 1e-6].
 
     Example:
         >>> opacity_from_logit(torch.zeros(2)).tolist()
@@ -41,13 +35,7 @@ def opacity_from_logit(logits: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def logit_from_opacity(opacities: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Convert opacities to the logits that files store.
-
-    Args:
-        opacities: Opacities, clamped to [1e-6, 1 - 1e-6] first.
-
-    Returns:
-        Finite logits.
+    """Convert opacities, clamped to [1e-6, 1 - 1e-6], to the finite logits that files store.
 
     Example:
         >>> logit_from_opacity(torch.tensor([0.5])).tolist()
@@ -57,13 +45,7 @@ def logit_from_opacity(opacities: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def clamp_logits(logits: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Clamp logits to those of opacities 1e-6 and 1 - 1e-6.
-
-    Args:
-        logits: Stored opacities; infinities are valid.
-
-    Returns:
-        Logits in [-13.8, 13.8]; NaN stays NaN.
+    """Clamp logits, also infinite ones, to those of 1e-6 and 1 - 1e-6, +-13.8; NaN stays NaN.
 
     Example:
         >>> clamp_logits(torch.tensor([float("-inf"), 1.0])).tolist()
@@ -73,15 +55,9 @@ def clamp_logits(logits: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def optical_depth_from_logit(logits: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Return the optical depth ``-log(1 - a)`` of Gaussians with opacity ``a = sigmoid(logit)``.
+    """Return the optical depth ``-log(1 - a)``, from 1e-6 to 13.8, of ``a = sigmoid(logit)``.
 
     ``-log(1 - sigmoid(x))`` is ``softplus(x)``, which loses no digits at either end.
-
-    Args:
-        logits: Stored opacities.
-
-    Returns:
-        Optical depths, from 1e-6 to 13.8.
 
     Example:
         >>> round(optical_depth_from_logit(torch.zeros(1)).item(), 4)
@@ -93,11 +69,7 @@ def optical_depth_from_logit(logits: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]
 def opacity_from_optical_depth(depths: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Return the opacity ``1 - exp(-tau)``, the inverse of :func:`optical_depth_from_logit`.
 
-    Args:
-        depths: Optical depths, at least 0.
-
-    Returns:
-        Opacities in [0, 1]; 1 only by rounding, from depths of 17 on (float64: 37).
+    Opacities of depths of at least 0 are in [0, 1]; 1 only by rounding, from 17 on (float64: 37).
 
     Example:
         >>> round(opacity_from_optical_depth(torch.tensor([0.6931472])).item(), 4)
@@ -107,13 +79,7 @@ def opacity_from_optical_depth(depths: Float[Tensor, "*n"]) -> Float[Tensor, "*n
 
 
 def positive_log(values: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Take logarithms of values that should be positive but may have underflowed.
-
-    Args:
-        values: Numbers, at least 0.
-
-    Returns:
-        Logarithms; 0 counts as the smallest normal number of the dtype.
+    """Take logarithms of numbers of at least 0, where 0 counts as the smallest normal number.
 
     Example:
         >>> positive_log(torch.tensor([1.0])).item()
@@ -123,14 +89,7 @@ def positive_log(values: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def divide(numerator: Float[Tensor, "*n"], denominator: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Divide, taking 0 / 0 as 0.
-
-    Args:
-        numerator: Any numbers.
-        denominator: Numbers, at least 0.
-
-    Returns:
-        The quotients; denominators below the smallest normal number count as that number.
+    """Divide by numbers of at least 0, where 0 counts as the smallest normal number: 0 / 0 is 0.
 
     Example:
         >>> divide(torch.tensor([0.0, 1.0]), torch.tensor([0.0, 2.0])).tolist()
@@ -140,15 +99,9 @@ def divide(numerator: Float[Tensor, "*n"], denominator: Float[Tensor, "*n"]) -> 
 
 
 def logit_from_optical_depth(depths: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Return the opacity logit of an optical depth (inverse of :func:`optical_depth_from_logit`).
+    """Return the opacity logit, in [-13.8, 13.8], of an optical depth of at least 0.
 
     ``logit(1 - exp(-tau))`` is ``tau + log(1 - exp(-tau))``, which loses no digits at either end.
-
-    Args:
-        depths: Optical depths, at least 0.
-
-    Returns:
-        Logits in [-13.8, 13.8].
 
     Example:
         >>> round(logit_from_optical_depth(torch.tensor([0.6931472])).item(), 4)
@@ -158,15 +111,9 @@ def logit_from_optical_depth(depths: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]
 
 
 def normalize_quats(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
-    """Scale quaternions to unit length.
+    """Scale non-zero, finite quaternions to unit length, with the same sign.
 
     The largest component is divided out first, so that tiny and huge quaternions survive.
-
-    Args:
-        quats: Non-zero, finite quaternions.
-
-    Returns:
-        Unit quaternions of the same orientation and sign.
 
     Example:
         >>> normalize_quats(torch.tensor([[2.0, 0.0, 0.0, 0.0]])).tolist()
@@ -178,14 +125,7 @@ def normalize_quats(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
 
 
 def multiply_quats(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
-    """Multiply quaternions: the rotation ``b`` followed by the rotation ``a``.
-
-    Args:
-        a: Quaternions, w first.
-        b: Quaternions, w first.
-
-    Returns:
-        Their Hamilton products.
+    """Return Hamilton products of quaternions, w first: the rotation ``b`` and then ``a``.
 
     Example:
         >>> i, j = torch.tensor([[0.0, 1, 0, 0]]), torch.tensor([[0.0, 0, 1, 0]])
@@ -198,14 +138,9 @@ def multiply_quats(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Te
 
 
 def quats_to_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """Return the rotation matrices of unit quaternions.
+    """Return the rotation matrices of unit quaternions, w first; column ``k`` is axis ``k``.
 
-    Args:
-        quats: Unit quaternions, w first.
-
-    Returns:
-        Rotation matrices; column ``k`` is the image of axis ``k``. In memory, each entry is
-        contiguous over all matrices, so that sums of products over many of them are fast.
+    In memory, each entry is contiguous over all matrices, so that sums of products are fast.
 
     Example:
         >>> quats_to_matrices(torch.tensor([[1.0, 0.0, 0.0, 0.0]]))[0].diagonal().tolist()
@@ -225,13 +160,7 @@ def quats_to_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
 
 
 def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """Return the rotation matrices of quaternions of any length.
-
-    Args:
-        quats: Non-zero, finite quaternions, w first.
-
-    Returns:
-        Rotation matrices, with the memory layout of :func:`quats_to_matrices`.
+    """Return the rotation matrices of quaternions of any length but 0, w first.
 
     Example:
         >>> rotation_matrices(torch.tensor([[2.0, 0.0, 0.0, 0.0]]))[0].diagonal().tolist()
@@ -241,16 +170,10 @@ def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
 
 
 def matrices_to_quats(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
-    """Return unit quaternions of rotation matrices, with w at least 0.
+    """Return unit quaternions, w first and at least 0, of rotation matrices of determinant +1.
 
     A matrix gives the quaternion in four ways, each by way of one component; the largest component
     is chosen (Shepperd 1978), so no digits are lost near half turns.
-
-    Args:
-        rotations: Rotation matrices with determinant +1.
-
-    Returns:
-        Unit quaternions, w first, w >= 0.
 
     Example:
         >>> matrices_to_quats(torch.eye(3)[None]).tolist()
@@ -281,14 +204,7 @@ def matrices_to_quats(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]
 def build_covariances(
     scales: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"]
 ) -> Float[Tensor, "n 3 3"]:
-    """Build ``R diag(s)^2 R^T``.
-
-    Args:
-        scales: Standard deviations along the axes of each Gaussian.
-        quats: Unit quaternions, w first.
-
-    Returns:
-        Symmetric covariance matrices, in squared units of ``scales``.
+    """Build ``R diag(s)^2 R^T`` of standard deviations and unit quaternions, w first.
 
     Example:
         >>> cov = build_covariances(torch.ones(1, 3), torch.tensor([[1.0, 0, 0, 0]]))
@@ -302,17 +218,11 @@ def build_covariances(
 def decompose_covariances(
     covariances: Float[Tensor, "n 3 3"],
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
-    """Split covariances into scales and unit quaternions.
+    """Split positive semi-definite covariances into scales and unit quaternions.
 
     The axes are canonical: scales descend, the largest component of each of the first two axes is
     positive, the third makes the frame right-handed, and w >= 0. Scales are at least 1e-6 times
     the largest one; a zero matrix gives tiny positive scales.
-
-    Args:
-        covariances: Symmetric positive semi-definite matrices.
-
-    Returns:
-        Scales, largest first, and unit quaternions.
 
     Example:
         >>> scales, quats = decompose_covariances(torch.diag(torch.tensor([1.0, 9.0, 4.0]))[None])
@@ -329,16 +239,10 @@ def decompose_covariances(
 
 
 def mean_projected_area(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Return the projected area of an ellipsoid, averaged over all directions.
+    """Return the projected area of an ellipsoid of semi-axes, averaged over all directions.
 
     By Cauchy's theorem it is a quarter of the surface, which Thomsen's formula (2004)
     approximates: ``pi * (((s1 s2)^p + (s1 s3)^p + (s2 s3)^p) / 3)^(1/p)``, p = 1.6075.
-
-    Args:
-        scales: Semi-axes; for a Gaussian, its standard deviations.
-
-    Returns:
-        Areas, in squared units of ``scales``.
 
     Example:
         >>> round(mean_projected_area(torch.ones(1, 3)).item(), 4)
@@ -352,16 +256,10 @@ def mean_projected_area(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
 
 
 def log_mean_projected_area(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Return the logarithm of :func:`mean_projected_area`, for scales of any magnitude.
+    """Return the logarithm of :func:`mean_projected_area` of logarithms of semi-axes.
 
     Only of needles is the ratio limited: the product of the largest two scales counts as at least
     3e-24 of the square of the largest one, or 4e-192 in float64.
-
-    Args:
-        log_scales: Natural logarithms of the semi-axes.
-
-    Returns:
-        Natural logarithms of the areas.
 
     Example:
         >>> round(log_mean_projected_area(torch.zeros(1, 3)).item(), 4)
@@ -374,13 +272,9 @@ def log_mean_projected_area(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, "
 
 
 def canonical_axes(axes: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
-    """Fix the signs of eigenvectors and make the frame right-handed.
+    """Make frames of orthonormal columns right-handed, and fix their signs.
 
-    Args:
-        axes: Orthonormal axes as columns.
-
-    Returns:
-        Rotations; the largest component of each of the first two axes is positive.
+    The largest component of each of the first two axes is positive.
 
     Example:
         >>> canonical_axes(-torch.eye(3)[None])[0].diagonal().tolist()

@@ -18,7 +18,6 @@ LARGEST_COLOR = 1.5
 """Limit of a colour, and of the norm of coefficients, where distances between colours decide."""
 
 SH_C1 = math.sqrt(3 / (4 * math.pi))  # the factor of the three linear functions
-
 SH_C2 = (math.sqrt(15 / (4 * math.pi)), math.sqrt(5 / (16 * math.pi)))
 """The factors of the quadratic functions: of ``xy``, ``yz``, ``xz`` (half of it of
 ``xx - yy``), and of ``2zz - xx - yy``."""
@@ -33,22 +32,12 @@ SH_C3 = (
 (half of it of ``z (xx - yy)``), ``y (4zz - xx - yy)`` and ``z (2zz - 3xx - 3yy)``."""
 
 CHUNK = 1 << 13  # colours at a time, whose values in all directions fit into a cache
-
 REST_COUNTS = (0, 3, 8, 15)  # coefficients per colour channel above the constant band, by degree
 _ROUNDING = 1e-12  # entries of a rotation of SH bands below this are set to zero
 
 
 def degree_of(rest_count: int) -> int:
-    """Return the SH degree for a number of view-dependent coefficients per channel.
-
-    Args:
-        rest_count: Coefficients per channel above the constant one.
-
-    Returns:
-        The degree, 0 to 3.
-
-    Raises:
-        InvalidArgumentError: The number belongs to no degree.
+    """Return the SH degree of 0, 3, 8 or 15 view-dependent coefficients per channel.
 
     Example:
         >>> degree_of(15)
@@ -63,21 +52,11 @@ def degree_of(rest_count: int) -> int:
 
 
 def rest_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:
-    """Evaluate the view-dependent basis functions, those above the constant one.
+    """Evaluate the basis functions above the constant one in unit vectors from the camera.
 
-    They are the real spherical harmonics with the Condon-Shortley phase, sorted within a degree by
-    order ``m`` from ``-l`` to ``l``, as in 3DGS (Kerbl et al. 2023) and PlenOctrees (Yu et al.
-    2021).
-
-    Args:
-        directions: Unit vectors, from the camera to the Gaussian.
-        degree: 0 to 3.
-
-    Returns:
-        Values, k in {0, 3, 8, 15}.
-
-    Raises:
-        InvalidArgumentError: The degree is not from 0 to 3.
+    They are the real spherical harmonics with the Condon-Shortley phase, sorted within a degree, 0
+    to 3, by order ``m`` from ``-l`` to ``l``, as in 3DGS (Kerbl et al. 2023) and PlenOctrees (Yu et
+    al. 2021).
 
     Example:
         >>> rest_basis(torch.tensor([[0.0, 0.0, 1.0]]), 1)
@@ -120,16 +99,7 @@ def evaluate(
 ) -> Float[Tensor, "n 3"]:
     """Evaluate colours: ``0.5`` plus the spherical harmonics in the directions, at least 0.
 
-    Args:
-        sh0: Constant band.
-        shN: View-dependent bands; without any, directions are ignored.
-        directions: Unit vectors, from the camera to the Gaussian.
-
-    Returns:
-        Red, green and blue, at least 0; above 1 is possible.
-
-    Raises:
-        InvalidArgumentError: ``shN`` has a number of coefficients that belongs to no degree.
+    Directions are unit vectors from the camera; without view-dependent bands, they are ignored.
 
     Example:
         >>> evaluate(torch.zeros(1, 1, 3), torch.zeros(1, 0, 3), torch.zeros(1, 3)).tolist()
@@ -148,18 +118,9 @@ def clamped_parts(
 ) -> Float[Tensor, "n k_plus_1 3"]:
     """Return coefficients of the parts of colours below zero, which images show as zero.
 
-    They are the best fit, by least squares, in 26 directions: a cubature that is exact for the
-    products of the basis functions (Lebedev 1976), and that no turn between axes changes.
-
-    Args:
-        sh0: Constant band.
-        shN: View-dependent bands.
-
-    Returns:
-        Coefficients, float64, the constant band first; 0 for colours that are nowhere below zero.
-
-    Raises:
-        InvalidArgumentError: ``shN`` has a number of coefficients that belongs to no degree.
+    They are float64, the constant band first: the best fit, by least squares, in 26 directions, a
+    cubature that is exact for the products of the basis functions (Lebedev 1976), and that no turn
+    between axes changes.
 
     Example:
         >>> dark = torch.full((1, 1, 3), -0.75 / SH_C0)
@@ -201,16 +162,6 @@ def rotated_rest(
 
     The new colour along ``R d`` equals the old one along ``d``. Every band is closed under
     rotation, so its matrix follows from the basis in a few directions, in float64.
-
-    Args:
-        shN: View-dependent bands.
-        rotation: Rotation matrix.
-
-    Returns:
-        The bands of the rotated Gaussians; ``shN`` itself if it has no bands.
-
-    Raises:
-        InvalidArgumentError: ``shN`` has a number of coefficients that belongs to no degree.
 
     Example:
         >>> half = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
