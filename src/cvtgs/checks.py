@@ -23,11 +23,7 @@ _WORDS = {"Float": "floats", "Bool": "booleans", "Int": "signed integers", "Inte
 
 
 def checked(function: Callable[P, Result]) -> Callable[P, Result]:
-    """Check the classes of arguments, and the dtypes and shapes of tensors, as annotated.
-
-    A letter of a shape stands for one length in all arguments. Numbers and texts are left to the
-    function. Nothing waits for a device.
-    """
+    """Check classes of arguments, and dtypes and shapes of tensors, as annotated; nothing waits."""
     given = {name: item.annotation for name, item in signature(function).parameters.items()}
     kinds = {name: kind for name, kind in given.items() if _is_class(kind)}
 
@@ -48,8 +44,11 @@ def check_kinds(kinds: Mapping[str, Any], values: Mapping[str, object]) -> None:
             if not isinstance(value, kind):
                 accepted = get_args(kind) or [kind]
                 wanted = " or ".join(dict.fromkeys(_in_words(one, sizes) for one in accepted))
-                raise InvalidArgumentError(f"{name} must be {wanted}, found {_found(value)}.")
-            if isinstance(value, Tensor):
+                found = type(value).__name__
+                if isinstance(value, Tensor):
+                    found = f"{value.dtype} of shape {tuple(value.shape)}"
+                raise InvalidArgumentError(f"{name} must be {wanted}, found {found}.")
+            if isinstance(value, Tensor):  # a letter stands for one length in all arguments
                 letters = getattr(kind, "dim_str", "").split()
                 sizes |= dict(zip(letters, value.shape, strict=False))
 
@@ -71,12 +70,6 @@ def _in_words(kind: Any, sizes: Mapping[str, int]) -> str:
     return f"a tensor of {_WORDS[kind.__name__.partition('[')[0]]} of shape ({shape}{comma})"
 
 
-def _found(value: object) -> str:
-    if isinstance(value, Tensor):
-        return f"{value.dtype} of shape {tuple(value.shape)}"
-    return type(value).__name__
-
-
 def check_range(values: Tensor, most: float, name: str) -> None:
     """Raise unless all values are from 0 to a number; those on other devices than CPUs pass."""
     if values.device.type == "cpu" and len(values):
@@ -88,10 +81,7 @@ def check_range(values: Tensor, most: float, name: str) -> None:
 
 
 def check_amounts(amounts: object, name: str, count: int, *, ignored: int = 0) -> None:
-    """Raise unless there is a number of at least 0 for every Gaussian but the first, ignored ones.
-
-    It waits for the device.
-    """
+    """Raise unless all Gaussians but the first, ignored ones have a number of at least 0."""
     shape = tuple(amounts.shape) if isinstance(amounts, Tensor) else type(amounts).__name__
     if not isinstance(amounts, Tensor) or shape != (count,):
         raise InvalidArgumentError(
@@ -106,11 +96,9 @@ def check_amounts(amounts: object, name: str, count: int, *, ignored: int = 0) -
 
 
 def row_numbers(rows: Rows, count: int, *, things: str, device: torch.device) -> Int[Tensor, "m"]:
-    """Return the numbers of the selected rows, from 0 on, as int32 or int64.
+    """Return the numbers of selected rows, from 0 on; negative ones count from the end.
 
-    ``rows`` is a slice, a mask, or row numbers, of which negative ones count from the end.
-    ``things`` names them in errors. Numbers on other devices than CPUs are not checked, since that
-    would wait for the device.
+    Errors name them ``things``. Numbers on other devices than CPUs are not checked: it would wait.
     """
     if isinstance(rows, slice):
         these = range(count)[rows]

@@ -14,20 +14,12 @@ from cvtgs.errors import DroppedDataWarning, InvalidSceneError, warn
 from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 
-__all__ = [
-    "CheckedScene",
-    "check_rows",
-    "invalid_rows",
-    "standardized",
-]
+__all__ = ["CheckedScene", "check_rows", "invalid_rows", "standardized"]
 
-UNIT_TOLERANCE = 1e-5
-"""Quaternions whose squared length differs from 1 by at most this count as unit quaternions."""
-
+UNIT_TOLERANCE = 1e-5  # largest difference from 1 of the squared length of a unit quaternion
 MAX_MEAN = torch.finfo(torch.float32).max  # files and renderers hold float32
 MAX_LOG_SCALE = 88.72  # its exponential is finite in float32
 _FAR = 1e6  # distance from the origin at which float32 has a resolution of a sixteenth of a unit
-
 _HARMLESS = 1 / 16  # share of a standard deviation by which a Gaussian may move unseen
 
 
@@ -196,11 +188,8 @@ def standardized(scene: GaussianScene) -> GaussianScene:
 
 
 def lost_step(scene: GaussianScene, *, in_file: bool = False) -> float:
-    """Return the step between float32 coordinates far from the origin; 0 where it is harmless.
-
-    Scenes in float64 have none, but files store them as float32 (``in_file``).
-    """
-    if len(scene) == 0 or (scene.means.element_size() > 4 and not in_file):
+    """Return the step between float32 coordinates far from the origin; 0 where it is harmless."""
+    if len(scene) == 0 or (scene.dtype == torch.float64 and not in_file):  # files have float32
         return 0.0
     far = float(scene.means.nanmedian(dim=0).values.abs().amax())
     if not _FAR <= far < math.inf:

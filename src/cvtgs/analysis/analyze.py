@@ -78,14 +78,7 @@ class SceneAnalysis:
         return self.areas * self.opacities
 
     def select(self, rows: Tensor) -> Self:
-        """Return the analysis of some Gaussians.
-
-        Args:
-            rows: Row numbers.
-
-        Returns:
-            Their values; frame, farthest distance and plan remain those of the whole scene.
-        """
+        """Return the values of some Gaussians; frame, farthest and plan remain of the scene."""
         observed = self.observed
         if observed is not None:
             observed = replace(observed, contributions=observed.contributions[rows])
@@ -290,10 +283,7 @@ def measure_contributions(
     cameras: Cameras | None = None,
     on_image: Callable[[int], None] = lambda done: None,
 ) -> SceneAnalysis:
-    """Correct apparent areas, and the haze effect, by the contributions to images of the scene.
-
-    ``on_image`` is called with the number of finished images, if they are kept.
-    """
+    """Correct apparent areas, and the haze effect, by the contributions to images of the scene."""
     used, observed = drop_unused_bands(scene, analysis.plan), None
     views = visibility_cameras(used, config, cameras=cameras)
     if config.match.enabled or (cameras is not None and config.match.error_power > 0.0):
@@ -321,10 +311,7 @@ def measure_contributions(
 def visibility_cameras(
     scene: GaussianScene, config: SimplifyConfig, *, cameras: Cameras | None = None
 ) -> Cameras:
-    """Return the cameras of the images that contributions are measured in.
-
-    They have two sizes and every second, third, ... pixel; about a third ignore the tag mip.
-    """
+    """Return the cameras of the images that contributions are measured in, of two sizes."""
     choices = config.visibility
     least = SSIM_WINDOW * choices.stride
     if cameras is None:
@@ -345,11 +332,8 @@ def measured_areas(
     share: float,
     mass_per_pixel: Float[Tensor, ""] | None = None,
 ) -> Float[Tensor, "n"]:
-    """Return apparent areas that are corrected by the contributions to images.
-
-    ``mass_per_pixel`` is that of a larger scene; None for that of these Gaussians.
-    """
-    if mass_per_pixel is None:
+    """Return apparent areas that are corrected by the contributions to images."""
+    if mass_per_pixel is None:  # else that of a larger scene
         mass_per_pixel = (areas * opacities).double().sum() / contributions.sum()
     shown = (1.0 - share) * contributions * mass_per_pixel
     blended = share * (areas * opacities).double() + shown

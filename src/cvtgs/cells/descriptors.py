@@ -14,6 +14,7 @@ from cvtgs.text import short_repr
 MEMBER_FEATURES = 19  # number of features of a member relative to its cell
 PAIR_FEATURES = 18  # number of features of a neighbour relative to a cell
 CELL_FEATURES = 21  # number of features of a cell itself
+
 DISTANCE, DISTANCE_BACK = 3, 11
 """Indices of the features of a neighbour that are ``log(1 + d)`` of its distance in standard
 deviations of the cell, and in its own."""
@@ -23,9 +24,7 @@ AREA, AREA_SCALE = 13, 0.2
 that of the cell, and its factor."""
 
 PIXEL_SCALE = 0.3  # factor of the logarithm of a size in pixels, the last feature of a cell
-
-LEAST_PIXELS = -6.0
-"""Logarithm of the size in pixels of the smallest cells that training scenes have."""
+LEAST_PIXELS = -6.0  # logarithm of the size in pixels of the smallest cells of training scenes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,14 +71,7 @@ class Descriptors:
         return Partition(order=self.rows, offsets=self.offsets)
 
     def select(self, cells: Int[Tensor, "s"]) -> Self:
-        """Return the descriptors of some cells.
-
-        Args:
-            cells: The cells to keep, ascending.
-
-        Returns:
-            Their descriptors, in the same order.
-        """
+        """Return the descriptors of some cells, which ascend."""
         numbers = torch.arange(len(self.members), device=self.offsets.device)
         part = Partition(order=numbers, offsets=self.offsets).select(cells)
         return type(self)(
@@ -95,27 +87,13 @@ class Descriptors:
         )
 
     def in_images(self, factor: float) -> Self:
-        """Return the descriptors of the same cells in larger images.
-
-        Args:
-            factor: Ratio of the image sizes, above 0.
-
-        Returns:
-            Descriptors whose sizes in pixels are larger by the factor.
-        """
+        """Return the descriptors of the same cells in images that are larger by a factor."""
         cells = self.cells.clone()
         cells[:, -1] += PIXEL_SCALE * math.log(factor)
         return replace(self, cells=cells)
 
     def to(self, target: torch.device | torch.dtype) -> Self:
-        """Return the descriptors on a device or in another precision.
-
-        Args:
-            target: A device, or a dtype for all but ``rows`` and ``offsets``.
-
-        Returns:
-            The moved or converted descriptors.
-        """
+        """Return the descriptors on a device, or in a dtype but for ``rows`` and ``offsets``."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         moved = {
             name: value.to(target)

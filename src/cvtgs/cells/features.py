@@ -21,12 +21,8 @@ from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
 LARGEST_DISTANCE = 50.0  # distances in features are clamped to this, in standard deviations
-
-LARGEST_POSITION, LARGEST_LOG = 1e4, 80.0
-"""Limits of positions and log scales, so that no product of them overflows float32."""
-
-LARGEST_CONTRAST = 1.0
-"""Contrast of black and white: larger values are rare in training, and make networks grow cells."""
+LARGEST_POSITION, LARGEST_LOG = 1e4, 80.0  # so that no product of them overflows float32
+LARGEST_CONTRAST = 1.0  # of black and white: larger ones, rare in training, make cells grow
 
 
 class ActivatedGaussians(NamedTuple):
@@ -52,14 +48,11 @@ class RelativeGaussians(NamedTuple):
 
 
 class NeighborContext(NamedTuple):
-    """Some merged Gaussians, the cover of both ends of their axes, and their neighbours.
-
-    ``cover_difference`` is the cover of the negative end minus that of the positive one.
-    """
+    """Some merged Gaussians, the cover of both ends of their axes, and their neighbours."""
 
     merged: ActivatedGaussians
     cover: Tensor
-    cover_difference: Tensor
+    cover_difference: Tensor  # that of the negative end minus that of the positive one
     pairs: Tensor
     positions: Tensor
 
@@ -143,10 +136,7 @@ def neighbor_context(
     neighbors: Int[Tensor, "m k"],
     sizes: Int[Tensor, "m_all"],
 ) -> NeighborContext:
-    """Compute features of the neighbours of some merged Gaussians, in the same way as of members.
-
-    Memory: about ``1 kB`` per neighbour.
-    """
+    """Compute features of the neighbours of some merged Gaussians; memory: ``1 kB`` for each."""
     others, shape = neighbors.flatten(), neighbors.shape
     ids = torch.arange(len(cells), device=cells.device).repeat_interleave(shape[1])
     merged, other = _activate(scene, cells), _activate(scene, others)
@@ -324,9 +314,7 @@ def _cell_features(
 ) -> Float[Tensor, "m c"]:
     """Return cover, inner extent, count, opacity, depth, shape, contrast, visibility of cells.
 
-    The last two are whether the scene is tagged ``SplatRenderMode: mip``, and the size in pixels:
-    images widen all splats by a fraction of a pixel, which closes gaps between small cells, but not
-    in tagged scenes.
+    The last two are the tag mip and the size in pixels: dilation closes gaps only without the tag.
     """
     merged, log_scales = context.merged, context.merged.log_scales
     distances = context.positions.square().sum(dim=2).sqrt()

@@ -14,17 +14,10 @@ from cvtgs.math.eigen import symmetric_eigen
 from cvtgs.math.segments import gather_columns, take_columns
 from cvtgs.scene import GaussianScene
 
-EQUAL_SHARE = 1e-2
-"""The axes of two eigenvalues that differ by less than this share count as undetermined."""
-
-NEIGHBOR_PULL = 1e-4
-"""Neighbours pull at undetermined axes as if eigenvalues differed by this share."""
-
+EQUAL_SHARE = 1e-2  # axes of two eigenvalues that differ by less than this share are undetermined
+NEIGHBOR_PULL = 1e-4  # neighbours pull at these as if eigenvalues differed by this share
 PROBE_SIGMAS = 3.0  # both ends of an axis are probed this many standard deviations from the centre
-
-FULL_COVER = 0.1
-"""An end of an axis counts as fully covered where neighbours have at least this opacity."""
-
+FULL_COVER = 0.1  # least opacity of neighbours that fully cover an end of an axis
 CHUNK = 1 << 11  # cells per chunk of probing; each takes about ``1 kB`` per neighbour
 
 
@@ -69,12 +62,11 @@ def align_axes(
     pulled = torch.diag_embed(2 * (logs - logs[:, :1])) + NEIGHBOR_PULL * pulls * _open_pairs(logs)
     rotations = symmetric_eigen(pulled)[1].flip(-1)
     quats = parameters.matrices_to_quats(parameters.canonical_axes(axes @ rotations))
-    changes = {"log_scales": (rotations.square() * logs[:, :, None]).sum(dim=1), "quats": quats}
-    tensors = {
-        name: getattr(merged, name).index_copy(0, rows, values.to(merged.means.dtype))
-        for name, values in changes.items()
-    }
-    return merged.with_tensors(tensors)
+    turned = (rotations.square() * logs[:, :, None]).sum(dim=1)
+    return merged.with_tensors(
+        log_scales=merged.log_scales.index_copy(0, rows, turned.to(merged.dtype)),
+        quats=merged.quats.index_copy(0, rows, quats.to(merged.dtype)),
+    )
 
 
 def _pulls(
@@ -153,16 +145,13 @@ def inflate_cells(
 
     for _ in in_threads(inflate, partition.several().split(chunk), counts.device):
         pass
-    return merged.with_tensors({"log_scales": log_scales})
+    return merged.with_tensors(log_scales=log_scales)
 
 
 def side_cover(
     scene: GaussianScene, rows: Int[Tensor, "r"], neighbors: Int[Tensor, "r k"]
 ) -> Float[Tensor, "r 3 2"]:
-    """Return the opacity of neighbours three standard deviations along each axis, on either side.
-
-    Neighbours are composited, each with its opacity times its unnormalised density there.
-    """
+    """Return the opacity of neighbours three standard deviations along each axis, either way."""
     others = neighbors.flatten()
     ids = torch.arange(len(rows), device=rows.device).repeat_interleave(neighbors.shape[1])
     means, rotations, scales = _frames(scene, rows)

@@ -26,16 +26,10 @@ from cvtgs.math.segments import (
 from cvtgs.math.spherical_harmonics import clamped_parts
 from cvtgs.scene import GaussianScene
 
-CHUNK_MEMBERS = 1 << 15
-"""Members per chunk, each of about ``(60 + 6 k) * 8`` bytes, with k coefficients in ``shN``."""
-
-OPAQUE = -math.log(0.01)
-"""Optical depth of an opacity of 0.99, the largest that 3DGS paints at a pixel."""
-
+CHUNK_MEMBERS = 1 << 15  # of about ``(60 + 6 k) * 8`` bytes each, with k coefficients in ``shN``
+OPAQUE = -math.log(0.01)  # optical depth of an opacity of 0.99, the largest that 3DGS paints
 DOMINANT = 0.99  # a member with more than this share of the mass of its cell represents it
-
-FULL_DEPTH = math.pi**2 / 6
-"""The optical depth of an opaque Gaussian summed over an image, as a multiple of its area."""
+FULL_DEPTH = math.pi**2 / 6  # of an opaque Gaussian summed over an image, in units of its area
 
 
 @torch.no_grad()
@@ -177,12 +171,7 @@ def normalized_weights(
 def mean_and_covariance(
     members: Members, weights: Float[Tensor, "n"]
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3 3"]]:
-    """Compute the first two moments of each cell as a mixture.
-
-    The covariance is the weighted mean of the members' covariances plus the weighted spread of
-    their means; the spread is computed about the mean, in two passes, so that no digits are lost
-    far from the origin.
-    """
+    """Compute mean and covariance of each cell as a mixture, in two passes to lose no digits."""
     offsets, cells = members.offsets, members.cells
     first = members.means.index_select(0, offsets[:-1]).T.contiguous()
     local = members.means.T - take_columns(cells, first)
@@ -207,22 +196,16 @@ def merged_depth(
     rule: Literal["saturating", "union"],
     antialiased: bool = False,
 ) -> Float[Tensor, "m"]:
-    """Return the optical depth of the Gaussian that stands for a cell.
-
-    By ``union``, all members lie behind one another, and depths add up (the paper has this rule).
-    By ``saturating``, the contributions of members to an image add up
-    (:func:`integrated_depth`), until the cell is opaque. With the compensation of
-    Mip-Splatting, no dilation closes the gaps between merged Gaussians: then it is the geometric
-    mean of this depth and of the one that conserves central depth times area, which is deeper where
-    opaque members lie side by side.
-    """
-    if rule == "union":
+    """Return the optical depth of the Gaussian that stands for a cell."""
+    if rule == "union":  # all members lie behind one another
         return segment_sum(members.depths, members.offsets)
     images = integrated_depth(members.depths) * members.areas
     totals = segment_sum(images, members.offsets)
     found = depth_from_integrated(parameters.divide(totals, areas)).clamp_max(OPAQUE)
     if not antialiased:
         return found
+    # Under Mip-Splatting, no dilation closes gaps: the geometric mean with the depth that conserves
+    # central depth times area, which is deeper where opaque members lie side by side.
     centers = segment_sum(members.depths.clamp_max(OPAQUE) * members.areas, members.offsets)
     return torch.sqrt(found * parameters.divide(centers, areas).clamp_max(OPAQUE))
 
@@ -230,9 +213,7 @@ def merged_depth(
 def integrated_depth(depths: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Return the optical depth of Gaussians summed over an image, as a multiple of their area.
 
-    A Gaussian transmits ``1 - a g(x)`` of the light, with g = 1 at its centre. The integral of
-    ``-log(1 - a g(x))``, divided by its projected area ``2 pi sigma_1 sigma_2``, is the dilogarithm
-    ``Li2(a)``: it grows like a, and ends at ``pi^2 / 6``, however large the depth at the centre.
+    The integral of ``-log(1 - a g(x))`` over the area ``2 pi sigma_1 sigma_2``: ``Li2(a)``.
     """
     others = -parameters.positive_log(parameters.opacity_from_optical_depth(depths))  # -log(a)
     small = torch.minimum(depths, others)

@@ -16,18 +16,11 @@ from cvtgs.scene import GaussianScene
 
 CHUNK = 1 << 14  # Gaussians per chunk, of which a few columns fit into a cache
 
-UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Row and column of the six distinct entries of a symmetric matrix."""
-
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # distinct entries of a symmetric matrix
 MAX_COMPONENTS = 12  # largest number of components
 LEAST_SPREAD = 0.01  # smallest standard deviation of a component that counts, in units of RGB
-
-LEAST_SHARE = 0.1
-"""Smallest share of the variance of a component that neighbours have in common; less is chance."""
-
-MOST_MEDIANS = 1e6
-"""Largest unit of masses, in medians: a few giants must not make all others 0 in float32."""
-
+LEAST_SHARE = 0.1  # of the variance of a component that neighbours have in common; less is chance
+MOST_MEDIANS = 1e6  # largest unit of masses: a few giants must not make all others 0 in float32
 LARGEST_MASS = 1e30  # limit of masses, in this unit, so that sums are finite in float32
 SAMPLED_PAIRS = 1 << 14  # approximate number of pairs of neighbours in which components are sought
 
@@ -265,9 +258,7 @@ def view_colors(
 ) -> Float[Tensor, "n k"]:
     """Return the components of the view-dependent colour of some Gaussians, in units of RGB.
 
-    The sum of the squared differences of two Gaussians is at most the squared difference of their
-    view-dependent colours, averaged over all directions. Bands beyond those of ``components``,
-    which :func:`view_components` returns, are ignored.
+    Squared distances are at most those of their view-dependent colours, averaged over directions.
     """
     coefficients = bands.flatten(1)[:, : len(components)]
     norms = SH_C0 * torch.linalg.vector_norm(coefficients, dim=1, keepdim=True)

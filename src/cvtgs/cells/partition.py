@@ -26,12 +26,10 @@ from cvtgs.text import short_repr, shown
 
 MOST_SAMPLED = 32  # largest number of described members of a cell
 
-LEAST_RATE = 1e-9
-"""Limit of rates, so that weights stay finite where rounding samples a member of no mass."""
+LEAST_RATE = 1e-9  # limit of rates: rounding may sample a member of no mass
 
 START = 0.5 * (3.0 - math.sqrt(5.0))
-"""Where sampling starts, in steps. It is irrational, so that rounding never decides between
-members of equal mass."""
+"""Where sampling starts, in steps: irrational, or rounding would decide between equal masses."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -146,18 +144,9 @@ class Partition:
         return true_rows(self.counts > 1, known)
 
     def select(self, cells: Int[Tensor, "k"] | Bool[Tensor, "m"], total: int | None = None) -> Self:
-        """Keep some cells.
-
-        Args:
-            cells: The cells to keep, ascending, or a mask of them.
-            total: Number of their members, if known.
-
-        Returns:
-            Their partition, in the same order.
-        """
+        """Keep some cells, ascending or by a mask; ``total`` members, if that is known."""
         counts = self.counts
-        if cells.dtype == torch.bool:
-            cells = cells.nonzero()[:, 0]
+        cells = cells.nonzero()[:, 0] if cells.dtype == torch.bool else cells
         is_kept = torch.zeros_like(counts, dtype=torch.bool).index_fill(0, cells, value=True)
         members = torch.repeat_interleave(is_kept, counts, output_size=len(self.order))
         offsets = torch.nn.functional.pad(counts[cells].cumsum(0), (1, 0))
@@ -190,14 +179,7 @@ class Partition:
         return type(self)(order=self.order[members], offsets=offsets)
 
     def cut(self, run: slice) -> Self:
-        """Keep some consecutive cells.
-
-        Args:
-            run: Range of cells, at least one.
-
-        Returns:
-            Their partition; its ``order`` is a view.
-        """
+        """Keep some consecutive cells, at least one; ``order`` becomes a view."""
         if run.start == 0 and run.stop >= len(self):
             return self
         ends = self.offsets[run.start : run.stop + 1]
@@ -243,11 +225,7 @@ class SampledMembers(NamedTuple):
 def sample_members(scene: GaussianScene, part: Partition) -> SampledMembers:
     """Take all members of small cells, and of large cells some in proportion to their mass.
 
-    Systematic sampling (Madow 1949): members are taken where the running sum of masses passes
-    equal steps. Members are in the order of a space-filling curve, so that the sample spreads over
-    the cell. A sum over all members is estimated by sampled values divided by their rates (Horvitz
-    and Thompson 1952). Masses, relative to the largest of the cell, are in float64, so that every
-    dtype gives the same sample.
+    Sums over all members are estimated by sampled values over rates (Horvitz and Thompson 1952).
     """
     counts, offsets, total = part.counts, part.offsets, len(part.order)
     on_host = part.order.device.type == "cpu"
@@ -259,6 +237,8 @@ def sample_members(scene: GaussianScene, part: Partition) -> SampledMembers:
     areas = parameters.log_mean_projected_area(log_scales.double())
     logs = areas + parameters.positive_log(opacities.double())
     masses = torch.exp(logs - segment_max(logs, offsets).index_select(0, ids))
+    # Systematic sampling (Madow 1949) where the sum of masses along a space-filling curve passes
+    # equal steps, in float64, so that every dtype gives the same sample.
     sums = torch.nn.functional.pad(running_sums(masses), (1, 0))
     starts, ends = (sums.index_select(0, rows) for rows in (offsets[:-1], offsets[1:]))
     table = torch.stack([starts, MOST_SAMPLED / (ends - starts), counts.double()])

@@ -23,11 +23,7 @@ class Record(pydantic.BaseModel):
     )
 
     def to_json(self) -> str:
-        """Return everything as indented JSON; infinity becomes the string ``Infinity``.
-
-        Returns:
-            JSON text that ends with a line break.
-        """
+        """Return everything as lines of indented JSON; infinity is the string ``Infinity``."""
         return self.model_dump_json(indent=2) + "\n"
 
 

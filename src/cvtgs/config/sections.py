@@ -338,25 +338,11 @@ class RefineConfig(ImageSection):
         return self
 
     def thinning(self, count: int) -> int:
-        """Return which pixels of an image a step uses.
-
-        Args:
-            count: Number of Gaussians.
-
-        Returns:
-            2 for every second one along rows and columns; 1 for all.
-        """
+        """Return 2 if a step for so many Gaussians uses every second row and column, 1 for all."""
         return 1 if self._times(count) == 1.0 else 2
 
     def for_count(self, count: int) -> Self:
-        """Return the settings with as many steps as a number of Gaussians needs.
-
-        Args:
-            count: Number of Gaussians.
-
-        Returns:
-            The same settings, or more steps if these use fewer pixels.
-        """
+        """Return the settings with as many steps as a number of Gaussians needs."""
         times = self._times(count)
         return self.model_copy(
             update={name: round(times * getattr(self, name)) for name in _IN_STEPS}
@@ -368,15 +354,7 @@ class RefineConfig(ImageSection):
         return min(side, self.lengthening) if side >= LEAST_LENGTHENING else 1.0
 
     def new_images(self, steps: int, *, shared: int = 0) -> int:
-        """Return the number of images of the full scene that some steps render, if available.
-
-        Args:
-            steps: Number of steps.
-            shared: Images that already exist, of which some are held out.
-
-        Returns:
-            Number of images to render.
-        """
+        """Return how many images of the full scene some steps render besides those shared."""
         used = steps * self.images_per_step
         learned = shared - self.heldout_of(shared) if shared else 0
         first = max(0, self.first_images - learned)
@@ -384,14 +362,7 @@ class RefineConfig(ImageSection):
         return min(used, first) + later // self.steps_per_image
 
     def heldout_of(self, count: int) -> int:
-        """Return the number of held-out views: an eighth, from 1 to ``heldout``.
-
-        Args:
-            count: Number of views.
-
-        Returns:
-            Number of views that decide what is kept.
-        """
+        """Return how many of some views are held out: an eighth, from 1 to ``heldout``."""
         return max(1, min(self.heldout, count // 8))
 
     @property

@@ -11,9 +11,7 @@ from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import LARGEST_COLOR, SH_C0
 
 CHUNK = 1 << 16  # Gaussians per chunk of the embedding, to bound memory
-
-FARTHEST = 1e30
-"""Coordinates are clamped to this, in robust radii, so that flyaways cannot overflow float32."""
+FARTHEST = 1e30  # limit of coordinates, in robust radii: flyaways must not overflow float32
 
 
 @checked

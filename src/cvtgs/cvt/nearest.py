@@ -22,9 +22,7 @@ NearestSite = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Maps points ``(n, d)`` and sites ``(m, d)`` to labels and squared distances ``(n,)``."""
 
 CHUNK = 1 << 15  # points per chunk of a search thread, to bound memory
-
-TINY_SHIFT = 1e-9
-"""Coincident sites are separated by at most this share of the robust radius of all sites."""
+TINY_SHIFT = 1e-9  # largest shift of coincident sites, as a share of the robust radius of all
 
 
 def search_device(device: torch.device) -> torch.device:
@@ -112,13 +110,10 @@ def _check_sites(sites: Float[Tensor, "m d"]) -> None:
 
 
 def build_tree(sites: Float[Tensor, "m d"]) -> Any:
-    """Build scipy's k-d tree, split at the middles of boxes.
-
-    Split at medians, the boxes around a few sites far from all others would be long and thin, and
-    a search from there would look at nearly all sites.
-    """
+    """Build scipy's k-d tree, split at the middles of boxes."""
     from scipy.spatial import cKDTree  # noqa: PLC0415 (heavy; `import cvtgs` stays light)
 
+    # Split at medians, boxes of a few far sites would be long: searches there would look at all.
     return cKDTree(sites.double().numpy(), balanced_tree=False)
 
 
@@ -168,11 +163,7 @@ def nearest_several(
 
 
 def _apart(sites: Float[Tensor, "m d"]) -> Float[Tensor, "m e"]:
-    """Add a coordinate that separates coincident sites, which a tree would compare pairwise.
-
-    It is so small that distances between distinct sites change only by rounding. Without it, tiles
-    would find the same few of them for all.
-    """
+    """Add a tiny coordinate that separates coincident sites, which trees compare pairwise."""
     runs = runs_of_equal(sites)
     if runs is None:
         return sites.double()
@@ -185,11 +176,7 @@ def _apart(sites: Float[Tensor, "m d"]) -> Float[Tensor, "m e"]:
 def _nearest_apart(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
-    """Find the nearest of sites that do not coincide, and their squared distances.
-
-    On the host, chunks of points are searched in as many threads as there are cores. The threads
-    are our own: an interrupt waits for them, but would leave scipy's own running.
-    """
+    """Find the nearest of sites that do not coincide, and their squared distances."""
     if sites.device.type == "cuda":
         return nearest_in_tiles(points, sites, count)
     ranks, parts = [*range(1, count + 1)], row_chunks(len(points), CHUNK, HOST)
@@ -204,7 +191,7 @@ def _nearest_apart(
 
         if len(parts) == 1:
             search(parts[0])
-        else:
+        else:  # in threads of our own: an interrupt would leave scipy's running
             with ThreadPoolExecutor(thread_count()) as pool:
                 list(pool.map(search, parts))
     except ValueError as error:
@@ -216,11 +203,8 @@ def _nearest_apart(
 
 
 def runs_of_equal(sites: Float[Tensor, "m d"]) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]] | None:
-    """Return an order that makes coincident sites adjacent, and their ranks; None if all differ.
-
-    Sites are sorted by a weighted sum of their coordinates, which is the same for equal ones. Where
-    different sites share a sum, some equal ones may stay apart; that costs time, not correctness.
-    """
+    """Return an order that makes coincident sites adjacent, and their ranks; None if all differ."""
+    # Equal sites have equal sums. Where others share them, some stay apart, which costs only time.
     keys = sites.new_zeros(len(sites), dtype=torch.float64)
     for axis, column in enumerate(sites.unbind(1)):
         keys += column.double() * math.sqrt(1 + axis)  # incommensurable: sums rarely coincide
