@@ -117,9 +117,6 @@ def visible_rows(
         at_least: If fewer than this many would stay, the heaviest of the dropped ones stay too,
             those first that images can show.
 
-    Returns:
-        Mask of the Gaussians that stay.
-
     Raises:
         InvalidArgumentError: Shapes do not fit together, a number is out of range, or (on the host)
             an opacity is not from 0 to 1.
@@ -171,9 +168,6 @@ def flyaway_rows(
         distances: Distances from the middle of the scene, in robust radii.
         masses: Masses as seen from the middle.
         max_share: Share of the total mass up to which the lightest far Gaussians are flyaways.
-
-    Returns:
-        Mask of the flyaways.
 
     Raises:
         InvalidArgumentError: Shapes do not fit together, or ``max_share`` is not from 0 to 1.

@@ -163,11 +163,7 @@ def apparent_areas(
 def perspective_falloff(distances: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     """Return the factor on the area of a far Gaussian as seen from the middle of the scene.
 
-    Args:
-        distances: Distances to the centre of the scene, in robust radii.
-
-    Returns:
-        ``1 / max(1, d)^2``, in the dtype of the distances.
+    It is ``1 / max(1, d)^2`` of distances to the centre in robust radii, in their dtype.
 
     Example:
         >>> perspective_falloff(torch.tensor([2.0]).double()).tolist()

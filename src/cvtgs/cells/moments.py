@@ -73,19 +73,13 @@ def gaussian_moments(
         unit: Divisor of both masses; None divides each by its mean, or a million medians
             if that is less.
 
-    Returns:
-        The moments, in the order of the rows.
-
     Example:
         >>> from cvtgs.math.frames import robust_frame
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 100, seed=0)
         >>> moments = gaussian_moments(
-        ...     scene,
-        ...     torch.arange(100),
-        ...     robust_frame(scene.means),
-        ...     masses=scene.masses,
-        ...     apparent_masses=scene.masses,
+        ...     scene, torch.arange(100), robust_frame(scene.means),
+        ...     masses=scene.masses, apparent_masses=scene.masses,
         ... )
         >>> moments.means.shape, moments.covariances.shape
         (torch.Size([3, 100]), torch.Size([6, 100]))
@@ -136,15 +130,9 @@ def mass_unit(masses: Float[Tensor, "n"], mean: Tensor | float) -> Float[Tensor,
 
 @checked
 def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Moments:
-    """Return the moments of groups; the spread of means is computed about the mean of the group.
+    """Return the moments of ``count`` groups by the labels of their members; none is empty.
 
-    Args:
-        members: Moments of the members.
-        labels: Group of each, 0 to ``count - 1``; none is empty.
-        count: Number of groups, m.
-
-    Returns:
-        Moments of the groups.
+    The spread of means is computed about the mean of the group.
 
     Example:
         >>> ones, x = torch.ones(2), torch.tensor([[0.0, 2.0], [0.0, 0.0], [0.0, 0.0]])

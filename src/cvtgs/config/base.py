@@ -56,12 +56,6 @@ class Section(pydantic.BaseModel):
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read a TOML file; a byte order mark, as editors on Windows write it, is skipped.
 
-    Args:
-        path: The file.
-
-    Returns:
-        The tables of the file.
-
     Raises:
         ConfigError: The file cannot be read, or is not TOML.
         InvalidArgumentError: ``path`` is no path.
@@ -100,14 +94,9 @@ def _parsed(path: str | os.PathLike[str], parse: Callable[[str], Any], kind: str
 def explain(
     error: pydantic.ValidationError, model: type[pydantic.BaseModel] = pydantic.BaseModel
 ) -> str:
-    """Describe the validation errors of some settings in one sentence.
+    """Describe the first validation errors of some settings in one sentence, with keys and values.
 
-    Args:
-        error: The error that pydantic raised.
-        model: The class of the settings, whose names are suggested for unknown ones.
-
-    Returns:
-        The first problems, each with its key and value, long ones shortened.
+    Names of the model are suggested for unknown ones; long values are shortened.
     """
     found = error.errors(include_url=False)
     wrong = {problem["loc"][:-1] for problem in found}  # what lacks entries since these are wrong

@@ -188,13 +188,7 @@ class SimplifyConfig(Section):
 
     @classmethod
     def from_preset(cls, name: str) -> Self:
-        """Return a preset.
-
-        Args:
-            name: One of :data:`cvtgs.config.PRESETS`.
-
-        Returns:
-            The configuration.
+        """Return one of :data:`cvtgs.config.PRESETS`.
 
         Raises:
             ConfigError: There is no such preset.
@@ -208,9 +202,6 @@ class SimplifyConfig(Section):
         Args:
             values: For example ``{"preset": "paper", "cvt": {"iterations": 10}}``.
 
-        Returns:
-            The configuration.
-
         Raises:
             ConfigError: The values are no mapping, a key is unknown or a value is out of range; the
                 message names it.
@@ -221,13 +212,7 @@ class SimplifyConfig(Section):
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
-        """Read a configuration file.
-
-        Args:
-            path: A TOML file with the keys of this class; missing keys come from its preset.
-
-        Returns:
-            The configuration.
+        """Read a configuration file in TOML; missing keys come from its preset.
 
         Raises:
             ConfigError: The file cannot be read, is not TOML, or holds a bad key or value.
@@ -252,9 +237,6 @@ class SimplifyConfig(Section):
             preset: Name of the preset; overrides the one in the file.
             settings: Texts by dotted key, for example ``{"cvt.iterations": "10"}``; they override
                 all others.
-
-        Returns:
-            The configuration.
 
         Raises:
             ConfigError: The file cannot be read, a key is unknown, or a value is out of range.
@@ -286,11 +268,7 @@ class SimplifyConfig(Section):
             raise
 
     def to_toml(self) -> str:
-        """Return the configuration as TOML text; :meth:`from_toml` reads it from a file.
-
-        Returns:
-            TOML text with all keys.
-        """
+        """Return all keys of the configuration as TOML text, which :meth:`from_toml` reads."""
         import tomli_w  # noqa: PLC0415 (only those who write a file need it)
 
         return tomli_w.dumps(self.model_dump())

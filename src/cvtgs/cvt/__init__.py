@@ -1,12 +1,7 @@
 """Weighted centroidal Voronoi tessellation of Gaussian centres: embedding, weights, cells."""
 
 from cvtgs.cvt.embedding import embed, gaussian_weights, tessellation_weights
-from cvtgs.cvt.nearest import (
-    NearestSite,
-    nearest_neighbors,
-    nearest_scipy,
-    nearest_site,
-)
+from cvtgs.cvt.nearest import NearestSite, nearest_neighbors, nearest_scipy, nearest_site
 from cvtgs.cvt.tessellate import (
     LloydResult,
     Tessellation,

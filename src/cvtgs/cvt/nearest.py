@@ -41,10 +41,6 @@ def nearest_site(
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
     """Find the nearest site of every point, on CUDA if they are there, else on the host.
 
-    Args:
-        points: Positions on any device.
-        sites: Positions on the same device, at least one.
-
     Returns:
         Labels and squared distances in float64. Ties may be resolved in any way.
 
@@ -66,20 +62,15 @@ def nearest_scipy(
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
     """Find the nearest site of every point with a k-d tree (Maneewongvatana and Mount 1999).
 
-    Distances are computed in float64. Points along a space-filling curve take half the time of
-    shuffled ones. The tree is on the host: positions from another device are copied there, and
-    the result back. Memory: ``16 n`` bytes for the result, and a chunk of points in float64.
-
-    Args:
-        points: Positions on any device.
-        sites: Positions, at least one.
+    Points along a space-filling curve take half the time of shuffled ones. The tree is on the
+    host: positions from another device are copied there, and the result back. Memory: ``16 n``
+    bytes for the result, and a chunk of points in float64.
 
     Returns:
-        Labels and squared distances in float64. Ties may be resolved in any way.
+        As :func:`nearest_site`.
 
     Raises:
-        InvalidArgumentError: There is no site, shapes do not fit together, or (on the host) a
-            coordinate is not finite.
+        InvalidArgumentError: As for :func:`nearest_site`.
 
     Example:
         >>> labels, squared = nearest_scipy(torch.tensor([[0.9]]), torch.tensor([[0.0], [1.0]]))

@@ -115,16 +115,13 @@ def tessellate(
 def choose_seeds(
     weights: Float[Tensor, "n"], count: int, *, config: TessellationConfig, seed: int
 ) -> Int[Tensor, "m"]:
-    """Choose the points at which the sites start.
+    """Choose the rows of the points at which the sites start.
 
     Args:
         weights: Weights of the points, in the order of a Morton curve.
         count: Number of sites.
         config: The settings; ``seeding`` is used.
         seed: Seed of the random numbers, if ``seeding`` draws any.
-
-    Returns:
-        Rows of the points.
 
     Raises:
         InvalidArgumentError: ``count`` is outside 1 to n, or a weight is negative or not finite.
@@ -272,19 +269,9 @@ def lloyd(
 ) -> LloydResult:
     """Move sites to the weighted centroids of their Voronoi cells (Lloyd 1982).
 
-    A site without points stays where it is, so the energy never rises.
-
-    Args:
-        points: Positions.
-        weights: Weights, at least 0.
-        sites: Initial sites.
-        nearest: Nearest-site search.
-        iterations: Largest number of iterations.
-        tolerance: Stop when an iteration lowers the energy by no more than this share.
-        on_iteration: Called with the number of finished iterations.
-
-    Returns:
-        The moved sites and the energies.
+    A site without points stays where it is, so the energy never rises. It stops when an iteration
+    lowers the energy by no more than the share ``tolerance``. ``on_iteration`` is called with the
+    number of finished iterations.
 
     Raises:
         InvalidArgumentError: Shapes do not fit together, ``iterations`` or ``tolerance`` is
@@ -345,12 +332,6 @@ def fill_empty_cells(
 
     Each cell keeps its cheapest point, so no cell becomes empty. A point in a cell of its own
     costs nothing, so the energy never rises.
-
-    Args:
-        labels: Cell of every point.
-        weights: Weights of the points.
-        squared: Squared distance of every point to its site.
-        count: Number of cells, at most n.
 
     Returns:
         New labels, new squared distances, and the number of cells that were empty.

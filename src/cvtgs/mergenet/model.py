@@ -323,14 +323,11 @@ class KnownRange(nn.Module):
         return (1 - beyond.amax(dim=1)).clamp(0, 1)
 
     def fit(self, cases: Iterable[Float[Tensor, "m f"]]) -> None:
-        """Set the range from the cells of the training cases.
+        """Set the range from the summaries of the cells of the training cases, at least one case.
 
         Tails are cut case by case, however few cells a case has; the range of a feature then goes
         from the smallest to the largest remaining value of all cases, that of the members at most
         to ``MOST_MEMBERS``.
-
-        Args:
-            cases: Summaries of the cells of every case, at least one case.
         """
         lows, highs = list[Tensor](), list[Tensor]()
         for summaries in cases:
