@@ -43,15 +43,7 @@ def filter_rows(
     """Drop faint Gaussians and flyaways, but keep at least the target number of Gaussians.
 
     All faint Gaussians are dropped; where they hold much mass together (haze), only the faintest.
-
-    Args:
-        scene: The Gaussians; all rows must be valid.
-        analysis: Areas and effect plan of the scene.
-        target: Minimum number of Gaussians to keep.
-        config: Thresholds.
-
-    Returns:
-        The rows that stay, and statistics of the dropped ones.
+    Rows of the scene must be valid.
 
     Raises:
         InvalidArgumentError: The analysis is of another scene, or ``target`` is outside 1 to n.

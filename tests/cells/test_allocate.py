@@ -8,7 +8,6 @@ import torch
 from cvtgs import SimplifyConfig, cvt
 from cvtgs.analysis import analyze
 from cvtgs.cells import Moments, gaussian_moments, group_moments, merge_pairs, reassign
-from cvtgs.cells.allocate import Heavy
 from cvtgs.config import AllocationConfig
 from cvtgs.grouping import (
     allocate,
@@ -101,7 +100,7 @@ def test_a_pair_that_images_hardly_show_merges_first():
 def cost_of_a_pair(groups, config):
     table = torch.cat([torch.atleast_2d(values).float() for values in groups])
     (cost,) = merge_pairs.__wrapped__.__globals__["_pair_costs"](
-        table, torch.tensor([0]), torch.tensor([1]), config, Heavy(mass=0.0, power=0.0)
+        table, torch.tensor([0]), torch.tensor([1]), config, (0.0, 0.0)
     )
     return float(cost)
 

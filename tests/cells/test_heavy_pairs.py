@@ -5,7 +5,6 @@ import torch
 
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.cells import Moments, merge_pairs
-from cvtgs.cells.allocate import Heavy
 from cvtgs.config import AllocationConfig
 from scenes import under_sky
 
@@ -52,10 +51,10 @@ def test_the_factor_by_hand() -> None:
     groups = groups_at([0.0, 0.1], [3.0, 4.0])
     table = torch.cat([torch.atleast_2d(values).float() for values in groups])
     pair, config = (torch.tensor([0]), torch.tensor([1])), AllocationConfig()
-    plain = float(costs(table, *pair, config, Heavy(0.0, 0.0)))
+    plain = float(costs(table, *pair, config, (0.0, 0.0)))
     for mass, power in ((7.0, 1.0), (3.5, 0.5), (0.0, 1.0), (7.0, 0.0)):
         factor = (1.0 + 7.0 / mass) ** power if mass else 1.0
-        found = float(costs(table, *pair, config, Heavy(mass, power)))
+        found = float(costs(table, *pair, config, (mass, power)))
         assert found == pytest.approx(factor * plain, rel=1e-5)
 
 

@@ -96,15 +96,9 @@ class SceneAnalysis:
 def analyze(
     scene: GaussianScene, config: SimplifyConfig, *, with_visibility: bool = False
 ) -> SceneAnalysis:
-    """Analyze a scene without rendering it.
+    """Analyze a scene, whose rows must be valid, without rendering it.
 
-    Args:
-        scene: The Gaussians; all rows must be valid.
-        config: The configuration.
-        with_visibility: Whether a network needs the ambient visibility.
-
-    Returns:
-        Frame, areas, visibility and effect plan.
+    The ambient visibility is computed if weights or, ``with_visibility``, a network need it.
 
     Raises:
         InvalidArgumentError: An argument has another type, or the scene is empty.

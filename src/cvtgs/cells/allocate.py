@@ -5,7 +5,6 @@ tessellation makes more cells than are wanted, and the cheapest pairs merge.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -40,13 +39,6 @@ LEAST_VISIBLE, MOST_VISIBLE = 1.5, 2.5
 SAMPLE = 1 << 16  # number of groups from which on only some of them show the contrast
 MOST_ROUNDS = 30  # number of vectorised rounds that choose disjoint pairs; captures need 6 to 11
 ROW_BITS, LAST_ROW = 32, (1 << 32) - 1  # keys to sort by have a row number in their lower bits
-
-
-class Heavy(NamedTuple):
-    """The apparent mass of a heavy pair, 0 for none, and the power by which its cost grows."""
-
-    mass: float
-    power: float
 
 
 @checked
@@ -106,7 +98,7 @@ def merge_pairs(
         "widest": config.widest if far > 0.0 else 0.0,  # a bounded scene has no sky
     }
     config = config.model_copy(update=update)
-    heavy = Heavy(config.heaviest * mass / count, min(1.0, far / MOSTLY_FAR))
+    heavy = config.heaviest * mass / count, min(1.0, far / MOSTLY_FAR)
     table = torch.cat([torch.atleast_2d(values).float() for values in groups])  # fast to gather
     total, device = len(groups.masses), groups.masses.device
     labels = torch.arange(total, device=device)
@@ -186,9 +178,13 @@ def _pair_costs(
     first: Tensor,
     second: Tensor,
     config: AllocationConfig,
-    heavy: Heavy,
+    heavy: tuple[float, float],
 ) -> Float[Tensor, "p"]:
-    """Return the cost of merging each pair, at least 0; infinite where float32 overflows."""
+    """Return the cost of merging each pair, at least 0; infinite where float32 overflows.
+
+    ``heavy`` is the mass of a heavy pair, 0 for none, and the power by which its cost grows.
+    """
+    heavy_mass, power = heavy
     volumes = _log_volume(table[6:12])  # the covariances
 
     def costs_of(part: slice) -> Tensor:
@@ -205,8 +201,8 @@ def _pair_costs(
             cost *= _fog_factor(joint, torch.lerp(two.means, one.means, share), config.widest)
         mass = one.apparent_masses + two.apparent_masses
         cost *= mass**config.mass_power
-        if heavy.mass > 0.0 and heavy.power > 0.0:
-            cost *= (1.0 + mass / heavy.mass) ** heavy.power
+        if heavy_mass > 0.0 and power > 0.0:
+            cost *= (1.0 + mass / heavy_mass) ** power
         cost *= one.counts + two.counts
         return cost[0].nan_to_num_(torch.inf, torch.inf).clamp_min_(0.0)
 
@@ -305,19 +301,9 @@ def reassign(
     """Move every member once to the group that explains it best, its own or a neighbouring one.
 
     The fit is the Kullback-Leibler divergence of the two Gaussians plus the squared distance of
-    their colours. The best-fitting member of each group stays, so that no group with members
-    becomes empty.
-
-    Args:
-        members: Moments of the members.
-        labels: Group of each.
-        groups: Moments of the groups; groups without members may gain some.
-        neighbors: Other groups that the members of each group may move to.
-        config: Weight of colour.
-        must_stay: Groups that must keep a member; None for all.
-
-    Returns:
-        The new group of every member.
+    their colours, of the weight in ``config``. The best-fitting member of each group that
+    ``must_stay`` (None for all) stays, so that no group with members becomes empty; groups without
+    members may gain some. Returns the new group of every member.
 
     Example:
         >>> from cvtgs.cells.moments import group_moments

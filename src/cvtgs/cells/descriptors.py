@@ -74,17 +74,11 @@ class Descriptors:
         """Return the descriptors of some cells, which ascend."""
         numbers = torch.arange(len(self.members), device=self.offsets.device)
         part = Partition(order=numbers, offsets=self.offsets).select(cells)
-        return type(self)(
-            members=self.members.index_select(0, part.order),
-            pairs=self.pairs.index_select(0, cells),
-            cells=self.cells.index_select(0, cells),
-            weights=self.weights[part.order],
-            shares=self.shares[part.order],
-            rows=self.rows[part.order],
-            offsets=part.offsets,
-            positions=self.positions.index_select(0, part.order),
-            pair_positions=self.pair_positions.index_select(0, cells),
-        )
+        of_members = ("members", "weights", "shares", "rows", "positions")
+        kept = dict.fromkeys(of_members, part.order)
+        kept |= dict.fromkeys(("pairs", "cells", "pair_positions"), cells)
+        taken = {name: getattr(self, name).index_select(0, rows) for name, rows in kept.items()}
+        return replace(self, offsets=part.offsets, **taken)
 
     def in_images(self, factor: float) -> Self:
         """Return the descriptors of the same cells in images that are larger by a factor."""

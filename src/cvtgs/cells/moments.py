@@ -9,7 +9,7 @@ from torch import Tensor
 from cvtgs.checks import checked
 from cvtgs.devices import HOST, in_chunks, move_together, one_thread
 from cvtgs.math.frames import RobustFrame
-from cvtgs.math.parameters import rotation_matrices
+from cvtgs.math.parameters import divide, rotation_matrices
 from cvtgs.math.segments import label_sums, take_columns
 from cvtgs.math.spherical_harmonics import LARGEST_COLOR, SH_C0
 from cvtgs.scene import GaussianScene
@@ -105,7 +105,6 @@ def gaussian_moments(
             varying[:, part] = view_colors(scene.shN.index_select(0, some), directions).T
 
     in_chunks(moments_of, count, CHUNK, device)  # a few columns of a chunk fit into a cache
-    tiny = torch.finfo(torch.float64).tiny
     masses, apparent_masses = masses.double(), apparent_masses.double()
     units = [
         mass_unit(values, values.mean()) if unit is None else values.new_tensor(unit)
@@ -113,8 +112,8 @@ def gaussian_moments(
     ]
     return Moments(
         counts=torch.ones_like(masses),
-        masses=(masses / units[0].clamp_min(tiny)).clamp(1e-12, LARGEST_MASS),
-        apparent_masses=(apparent_masses / units[1].clamp_min(tiny)).clamp_max(LARGEST_MASS),
+        masses=divide(masses, units[0]).clamp(1e-12, LARGEST_MASS),
+        apparent_masses=divide(apparent_masses, units[1]).clamp_max(LARGEST_MASS),
         means=means,
         covariances=covariances,
         colors=colors,
@@ -203,12 +202,8 @@ def view_components(
     neighbours share. In others they are mostly noise of the training, which makes neighbours look
     different where images do not. So the components are principal ones, and each counts by the
     share of its variance that is common to neighbours: the variance minus half of the mean squared
-    difference of neighbours (the nugget of a variogram, Matheron 1963), over the variance.
-
-    Args:
-        scene: The Gaussians.
-        rows: Row numbers, in the order of a space-filling curve.
-        masses: Mass of each as seen in images.
+    difference of neighbours (the nugget of a variogram, Matheron 1963), over the variance. Rows are
+    in the order of a space-filling curve, and masses as seen in images.
 
     Returns:
         The matrix that maps the coefficients of a Gaussian, flattened, to its components; float64,
@@ -229,7 +224,7 @@ def view_components(
     bands = scene.shN.index_select(0, rows.index_select(0, both))
     bands, weights = move_together([bands, masses.index_select(0, both)], HOST)
     colors, weights = view_colors(bands.double(), torch.eye(width, device=HOST)), weights.double()
-    weights = weights / weights.sum().clamp_min(torch.finfo(torch.float64).tiny)
+    weights = divide(weights, weights.sum())
     centered = colors - weights @ colors
     variances, axes = torch.linalg.eigh(centered.T @ (centered * weights[:, None]))
     (ones, others), pairs = colors.chunk(2), weights.view(2, -1).sum(dim=0)

@@ -85,10 +85,7 @@ class Partition:
         return cls(order=order, offsets=offsets, singles=singles)
 
     def check(self, total: int) -> None:
-        """Check that the cells are made of rows of a scene.
-
-        Args:
-            total: Number of Gaussians of the scene.
+        """Check that the cells are made of the rows of a scene, ``total`` in number.
 
         Raises:
             InvalidArgumentError: Types or shapes are wrong, a row is out of range, or a cell is
@@ -121,13 +118,9 @@ class Partition:
         return int((self.counts == 1).sum()) if self.singles is None else self.singles
 
     def labels(self, count: int) -> Int[Tensor, "n"]:
-        """Return the cell of every row, the inverse of :meth:`from_labels`.
+        """Return the cell of ``count`` rows, the inverse of :meth:`from_labels`, in int32.
 
-        Args:
-            count: Number of rows.
-
-        Returns:
-            Cells, int32; -1 for rows that belong to none.
+        It is -1 for rows that belong to none.
 
         Example:
             >>> Partition.from_labels(torch.tensor([1, 0, 1]), 2).labels(4).tolist()

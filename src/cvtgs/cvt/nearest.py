@@ -112,10 +112,6 @@ def build_tree(sites: Float[Tensor, "m d"]) -> Any:
 def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m k"]:
     """Find the nearest other sites of every site, on CUDA if they are there, else on the host.
 
-    Args:
-        sites: Positions on any device.
-        count: Number of neighbours per site; fewer if there are fewer other sites.
-
     Returns:
         Row numbers, k = min(count, m - 1); the site itself is not among them. Ties may be
         resolved in any way.

@@ -115,13 +115,9 @@ def tessellate(
 def choose_seeds(
     weights: Float[Tensor, "n"], count: int, *, config: TessellationConfig, seed: int
 ) -> Int[Tensor, "m"]:
-    """Choose the rows of the points at which the sites start.
+    """Choose the rows of the points at which the sites start, as ``config.seeding`` says.
 
-    Args:
-        weights: Weights of the points, in the order of a Morton curve.
-        count: Number of sites.
-        config: The settings; ``seeding`` is used.
-        seed: Seed of the random numbers, if ``seeding`` draws any.
+    Weights are in the order of a Morton curve; the seed is that of random numbers, if any occur.
 
     Raises:
         InvalidArgumentError: ``count`` is outside 1 to n, or a weight is negative or not finite.
@@ -138,12 +134,9 @@ def stratified_seeds(
 ) -> tuple[Int[Tensor, "count"], Float[Tensor, "count"]]:
     """Take points at equal steps of accumulated weight: systematic sampling, no random numbers.
 
-    Points that weigh at least one step are always taken, and the step is recomputed for the
-    others (Madow 1949), so every point is taken at most once.
-
-    Args:
-        weights: Weights of points along a space-filling curve, at least 0.
-        count: Number of points to take, at most n.
+    Weights, at least 0, are those of points along a space-filling curve. Points that weigh at least
+    one step are always taken, and the step is recomputed for the others (Madow 1949), so every
+    point is taken at most once.
 
     Returns:
         Row numbers, ascending, and the weight that each taken point represents; these weights
@@ -193,14 +186,10 @@ def stratified_seeds(
 def weighted_seeds(
     weights: Float[Tensor, "n"], count: int, generator: torch.Generator
 ) -> Int[Tensor, "count"]:
-    """Draw points at random without replacement, with probabilities by weight.
+    """Draw points at random without replacement, with probabilities by weight, at least 0.
 
-    The points with the smallest ``-log(u) / w`` are taken (Efraimidis and Spirakis 2006).
-
-    Args:
-        weights: Weights, at least 0; points of weight 0 are taken last.
-        count: Number of points to draw, at most n.
-        generator: Random generator on the CPU, so that every device draws the same.
+    The points with the smallest ``-log(u) / w`` are taken (Efraimidis and Spirakis 2006), those of
+    weight 0 last. The generator is on the CPU, so that every device draws the same.
 
     Returns:
         Row numbers, ascending.

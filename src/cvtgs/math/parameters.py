@@ -186,15 +186,13 @@ def matrices_to_quats(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]
     xy = rotations[:, 0, 1] + rotations[:, 1, 0]
     xz = rotations[:, 0, 2] + rotations[:, 2, 0]
     yz = rotations[:, 1, 2] + rotations[:, 2, 1]
-    candidates = torch.stack(
-        [
-            torch.stack([1 + m00 + m11 + m22, wx, wy, wz], dim=-1),
-            torch.stack([wx, 1 + m00 - m11 - m22, xy, xz], dim=-1),
-            torch.stack([wy, xy, 1 - m00 + m11 - m22, yz], dim=-1),
-            torch.stack([wz, xz, yz, 1 - m00 - m11 + m22], dim=-1),
-        ],
-        dim=1,
+    rows = (
+        [1 + m00 + m11 + m22, wx, wy, wz],
+        [wx, 1 + m00 - m11 - m22, xy, xz],
+        [wy, xy, 1 - m00 + m11 - m22, yz],
+        [wz, xz, yz, 1 - m00 - m11 + m22],
     )
+    candidates = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=1)
     best = candidates.diagonal(dim1=1, dim2=2).argmax(dim=-1)
     quats = normalize_quats(candidates[torch.arange(len(best), device=best.device), best])
     # Adding 0 turns -0.0 into 0.0, so that equal frames have equal bits.

@@ -192,7 +192,7 @@ def compose(
     neighbors: Int[Tensor, "m k"],
     residuals: Residuals,
 ) -> dict[str, Tensor]:
-    """Correct some merged Gaussians.
+    """Correct some merged Gaussians; return their standard tensors by name.
 
     Centres move and shapes turn in the frame of each merged Gaussian; residuals are added to log
     scales and opacity logits; every SH band gets shares of the differences of members and
@@ -206,9 +206,6 @@ def compose(
         cells: Row numbers of these cells in ``merged``.
         neighbors: The nearest other cells of each of these cells.
         residuals: Changes of these cells.
-
-    Returns:
-        The standard tensors of these cells, by name.
 
     Example:
         >>> from cvtgs.synthetic import scene as make

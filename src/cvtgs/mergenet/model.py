@@ -53,11 +53,8 @@ MARGIN = 0.1  # corrections fade to zero beyond the range over this share of its
 NARROWEST = 0.01  # smallest width of this fade, for features that did not vary in training
 
 MEMBERS, MOST_MEMBERS = 9, 2000
-"""Index of the feature ``0.2 log(members)``, and the number of members from which on it is outside
-the known range, so that corrections fade.
-
-Larger cells occur in the middle of unbounded scenes where most cells are spent on the sky. They
-cover the cameras when they grow, so the limit holds whatever the training cases contain.
+"""Index of the feature ``0.2 log(members)``, and the number from which on corrections fade: larger
+cells, of unbounded scenes where most cells are spent on the sky, cover the cameras when they grow.
 """
 
 WIDEST = 1e30  # absolute value of both ends of the range before it is fitted
