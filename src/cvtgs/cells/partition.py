@@ -197,9 +197,8 @@ class Partition:
         if count and len(self.order) + cell_cost * count <= max_members:
             yield slice(0, count), self
             return
-        first, costs = 0, self.offsets.cpu()
-        if cell_cost:
-            costs = costs + cell_cost * torch.arange(len(costs), device="cpu")
+        costs = self.offsets.cpu() + cell_cost * torch.arange(count + 1, device="cpu")
+        first = 0
         while first < count:
             fitting = torch.searchsorted(costs, costs[first] + max_members, right=True)
             last = max(first + 1, int(fitting) - 1)
