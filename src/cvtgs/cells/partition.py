@@ -51,14 +51,7 @@ class Partition:
     @classmethod
     @checked
     def from_labels(cls, labels: Integer[Tensor, "n"], count: int) -> Self:
-        """Build the partition of labelled rows.
-
-        Args:
-            labels: Cell of every row, 0 to ``count - 1``.
-            count: Number of cells.
-
-        Returns:
-            The partition; the members of a cell keep their order.
+        """Build the partition of rows by labels, 0 to ``count - 1``; members keep their order.
 
         Raises:
             InvalidArgumentError: Labels are no integers, one is out of range, or a cell has no
@@ -151,14 +144,9 @@ class Partition:
         return cells, self.select(cells, len(self.order) - (len(self) - len(cells)))
 
     def keep_only(self, rows: Int[Tensor, "m"], total: int | None = None) -> Self:
-        """Keep only one member of some cells.
+        """Keep only one member of some cells: the row of each, or all members where that is -1.
 
-        Args:
-            rows: For every cell, the row number of the member to keep, or -1 to keep all.
-            total: Total number of kept members, if known.
-
-        Returns:
-            The partition of the same cells.
+        ``total`` is the number of kept members, if known.
 
         Example:
             >>> whole = Partition.from_labels(torch.tensor([1, 0, 1]), 2)
@@ -184,11 +172,9 @@ class Partition:
         return type(self)(order=order, offsets=offsets, singles=self.singles)
 
     def chunks(self, max_members: int, *, cell_cost: int = 0) -> Iterator[tuple[slice, Self]]:
-        """Split the partition into runs of cells, to bound memory.
+        """Split the partition into runs of at most ``max_members`` members, to bound memory.
 
-        Args:
-            max_members: Largest number of members per run; a larger cell is a run of its own.
-            cell_cost: Number of members that is added to the size of each cell.
+        A larger cell is a run of its own; ``cell_cost`` members are added to the size of each cell.
 
         Yields:
             The range of cells of the run, and their partition.

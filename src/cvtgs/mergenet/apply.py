@@ -197,15 +197,8 @@ def compose(
     Centres move and shapes turn in the frame of each merged Gaussian; residuals are added to log
     scales and opacity logits; every SH band gets shares of the differences of members and
     neighbours. Zero residuals return the merged Gaussians bit for bit. Differentiable in the
-    residuals.
-
-    Args:
-        scene: The Gaussians.
-        merged: One Gaussian per cell, for all cells.
-        part: Members of the cells to correct.
-        cells: Row numbers of these cells in ``merged``.
-        neighbors: The nearest other cells of each of these cells.
-        residuals: Changes of these cells.
+    residuals. ``cells`` are the rows in ``merged`` of the cells to correct, ``part`` their members,
+    and ``neighbors`` their nearest other cells.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
