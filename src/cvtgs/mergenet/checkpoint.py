@@ -33,6 +33,7 @@ FORMAT = "cvtgs-mergenet"
 FORMAT_VERSION = 2  # files of version 1 have no known range, so their networks correct every cell
 KNOWN = "known."  # prefix of the names of the tensors of the known range
 LARGEST_FILE = 1 << 26  # files above 64 MiB are not read; a MergeNet has less than 1 MiB
+OTHER = "the checkpoint has a different architecture"  # start of messages
 
 
 class LearnedScene(Record):
@@ -119,17 +120,19 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
     path = Path(name)
     if name in SHIPPED:
         path = Path(str(resources.files("cvtgs.mergenet") / "data" / f"{name}.safetensors"))
-    tensors, metadata = _unpack(_read(path, name), name)
-    info = _parse_info(metadata, name)
-    digest = tensors_digest(tensors, metadata["info"])
-    if metadata.get("sha256") != digest:
-        raise CheckpointError(
-            f"{name}: the checkpoint is damaged: its content must have the hash "
-            f"{str(metadata.get('sha256'))[:12]}..., found {digest[:12]}..."
-        )
-    return Checkpoint(
-        net=_build_net(info, tensors, name), info=info, name=printable_name(name), digest=digest
-    )
+    try:
+        tensors, metadata = _unpack(_read(path, name))
+        info = _parse_info(metadata)
+        digest, stored = tensors_digest(tensors, metadata["info"]), metadata.get("sha256")
+        if stored != digest:
+            raise CheckpointError(
+                f"the checkpoint is damaged: its content must have the hash "
+                f"{str(stored)[:12]}..., found {digest[:12]}..."
+            )
+        net = _build_net(info, tensors)
+    except CheckpointError as error:
+        raise CheckpointError(f"{name}: {error}") from error.__cause__
+    return Checkpoint(net=net, info=info, name=printable_name(name), digest=digest)
 
 
 def encode_checkpoint(net: Net, info: CheckpointInfo) -> bytes:
@@ -159,61 +162,53 @@ def _read(path: Path, name: str) -> bytes:
             return path.read_bytes()
         path.stat()
     except (FileNotFoundError, ValueError):
-        preset = (
-            f" For the preset, write preset={name!r} (--preset {name})." if name in PRESETS else ""
-        )
+        hint = f" For the preset, write preset={name!r} (--preset {name})." * (name in PRESETS)
         raise CheckpointError(
-            f"{name}: no such checkpoint; it must be {' or '.join(SHIPPED)}, or a file.{preset}"
+            f"no such checkpoint; it must be {' or '.join(SHIPPED)}, or a file.{hint}"
         ) from None
     except OSError as error:
-        reason = reason_of(error)
-        raise CheckpointError(f"{name}: the checkpoint cannot be read: {reason}.") from error
-    raise CheckpointError(
-        f"{name}: a checkpoint must be a file of at most {LARGEST_FILE >> 20} MiB."
-    )
+        raise CheckpointError(f"the checkpoint cannot be read: {reason_of(error)}.") from error
+    raise CheckpointError(f"a checkpoint must be a file of at most {LARGEST_FILE >> 20} MiB.")
 
 
-def _unpack(content: bytes, name: str) -> tuple[dict[str, Tensor], dict[str, str]]:
+def _unpack(content: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
     try:
         tensors, metadata = unpack_tensors(content)
     except FileFormatError as error:
-        raise CheckpointError(
-            f"{name}: the checkpoint is not a safetensors file, or it is damaged."
-        ) from error
+        text = "the checkpoint is not a safetensors file, or it is damaged."
+        raise CheckpointError(text) from error
     if metadata.get("format") != FORMAT:
+        found = shown(metadata.get("format"))
         raise CheckpointError(
-            f"{name}: the file holds no MergeNet; its format must be {FORMAT!r}, "
-            f"found {shown(metadata.get('format'))}."
+            f"the file holds no MergeNet; its format must be {FORMAT!r}, found {found}."
         )
     return tensors, metadata
 
 
-def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
+def _parse_info(metadata: Mapping[str, str]) -> CheckpointInfo:
     version = metadata.get("format_version")
     if version not in {str(number) for number in range(1, FORMAT_VERSION + 1)}:
         raise CheckpointError(
-            f"{name}: the checkpoint has format version {version}, but this cvtgs reads only "
-            f"versions up to {FORMAT_VERSION}; update cvtgs."
+            f"the checkpoint has format version {version}, but this cvtgs reads only versions up "
+            f"to {FORMAT_VERSION}; update cvtgs."
         )
     try:
         info = CheckpointInfo.model_validate_json(metadata.get("info", ""))
     except pydantic.ValidationError as error:
         found = shortened(explain(error), 200)
         raise CheckpointError(
-            f"{name}: the checkpoint's description is missing or invalid: {found}"
+            f"the checkpoint's description is missing or invalid: {found}"
         ) from error
     if info.preset not in SHIPPED:
         raise CheckpointError(
-            f"{name}: the preset of the checkpoint must be one of {', '.join(SHIPPED)}, "
+            f"the preset of the checkpoint must be one of {', '.join(SHIPPED)}, "
             f"found {shown(info.preset)}."
         )
     ours, theirs = type(info.architecture)(), info.architecture
     for feature in ("member_features", "pair_features", "cell_features"):
-        if getattr(ours, feature, 0) != getattr(theirs, feature, 0):
-            raise CheckpointError(
-                f"{name}: the checkpoint has a different architecture: {feature} must be "
-                f"{getattr(ours, feature)}, found {getattr(theirs, feature)}."
-            )
+        wanted, number = getattr(ours, feature, 0), getattr(theirs, feature, 0)
+        if wanted != number:
+            raise CheckpointError(f"{OTHER}: {feature} must be {wanted}, found {number}.")
     return info
 
 
@@ -224,7 +219,7 @@ def build_network(architecture: Architecture | PublishedArchitecture) -> Net:
     return MergeNet(architecture)
 
 
-def _build_net(info: CheckpointInfo, tensors: dict[str, Tensor], name: str) -> Net:
+def _build_net(info: CheckpointInfo, tensors: dict[str, Tensor]) -> Net:
     with torch.device("meta"):  # draws no random numbers
         net = build_network(info.architecture)
     if isinstance(net, MergeNet) and not any(key.startswith(KNOWN) for key in tensors):
@@ -232,14 +227,12 @@ def _build_net(info: CheckpointInfo, tensors: dict[str, Tensor], name: str) -> N
         tensors = tensors | {key: own[key] for key in own if key.startswith(KNOWN)}
     wanted = {key: (values.shape, values.dtype) for key, values in net.state_dict().items()}
     found = {key: (values.shape, values.dtype) for key, values in tensors.items()}
-    if wanted != found:
-        odd = sorted(key for key in wanted | found if wanted.get(key) != found.get(key))
-        raise CheckpointError(
-            f"{name}: the checkpoint has a different architecture: {', '.join(odd[:3])} "
-            f"{'does' if len(odd) == 1 else 'do'} not fit."
-        )
+    odd = sorted(key for key in wanted | found if wanted.get(key) != found.get(key))
+    if odd:
+        verb = "does" if len(odd) == 1 else "do"
+        raise CheckpointError(f"{OTHER}: {', '.join(odd[:3])} {verb} not fit.")
     if not all(bool(torch.isfinite(values).all()) for values in tensors.values()):
-        raise CheckpointError(f"{name}: the checkpoint holds weights that are not finite.")
+        raise CheckpointError("the checkpoint holds weights that are not finite.")
     net.to_empty(device="cpu").load_state_dict(tensors)
     return net.eval().requires_grad_(False)
 
