@@ -233,13 +233,7 @@ def sample_points(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LloydResult:
-    """The result of Lloyd's algorithm.
-
-    Attributes:
-        sites: ``(m, d)`` final sites.
-        energies: ``sum w |x - site|^2`` before each iteration, in order; if it stops early, also
-            after the last one.
-    """
+    """The final sites of Lloyd's algorithm, and energies as of :class:`Tessellation`."""
 
     sites: Float[Tensor, "m d"]
     energies: tuple[float, ...]

@@ -63,14 +63,9 @@ class PublishedDescriptors:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PublishedResiduals:
-    """Unlimited changes of the merged Gaussians; zeros change nothing.
+    """Unlimited changes of the merged Gaussians, else as :class:`cvtgs.mergenet.Residuals`.
 
     Attributes:
-        d_means: ``(m, 3)`` moves of the centres, in the frame and the standard deviations of each.
-        d_log_scales: ``(m, 3)`` changes of the log scales.
-        d_rotvecs: ``(m, 3)`` rotation vectors v in the frame of each; the angle is
-            ``2 atan(|v| / 2)`` radians, which is about ``|v|`` if it is small.
-        d_logit_opacities: ``(m,)`` changes of the opacity logits.
         d_sh: ``(m, 16, 3)`` changes of the SH coefficients of all bands.
     """
 
