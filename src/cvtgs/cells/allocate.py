@@ -57,16 +57,9 @@ def merge_pairs(
     the number of Gaussians, which keeps groups balanced. The contrast of neighbouring groups
     scales the power and the weight of colour; far mass lowers the power. Pairs that would be seen
     at a wide angle cost more, and so do heavy ones where much mass is far, and far ones where less
-    of the far mass is hidden than of the near mass. Where no neighbours are left to merge, groups
-    of adjacent rows do.
-
-    Args:
-        groups: Moments of the groups.
-        neighbors: Groups that each group may merge with.
-        count: Number of groups to keep, 1 to m.
-        config: Weights of the cost.
-        area: Apparent mass of all groups, squared robust radii; None if it is not known, and far
-            mass is taken to be as hidden as near mass.
+    of the far mass is hidden than of the near mass; that depends on the ``area`` of all groups,
+    their apparent mass in squared robust radii, if it is known. Where no neighbours are left to
+    merge, groups of adjacent rows do.
 
     Returns:
         The new group of every group, 0 to ``count - 1``.

@@ -61,17 +61,11 @@ def gaussian_moments(
     components: Float[Tensor, "c k"] | None = None,
     unit: float | None = None,
 ) -> Moments:
-    """Return the moments of single Gaussians.
+    """Return the moments of single Gaussians, in the order of their rows, in robust radii.
 
-    Args:
-        scene: The Gaussians.
-        rows: Row numbers of the Gaussians to use.
-        frame: Centre and radius of the scene; the radius is the unit of length.
-        masses: Mass of each.
-        apparent_masses: Mass of each as seen in images.
-        components: Result of :func:`view_components`; None for no view-dependent colour.
-        unit: Divisor of both masses; None divides each by its mean, or a million medians
-            if that is less.
+    Masses, and those as seen in images, are divided by ``unit``; None divides each by its mean, or
+    a million medians if that is less. ``components`` is the result of :func:`view_components`; None
+    for no view-dependent colour.
 
     Example:
         >>> from cvtgs.math.frames import robust_frame
