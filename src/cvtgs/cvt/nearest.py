@@ -13,7 +13,7 @@ from torch import Tensor
 from cvtgs.checks import checked
 from cvtgs.counts import checked_whole
 from cvtgs.cvt.device_search import nearest_in_tiles
-from cvtgs.devices import HOST, row_chunks, thread_count
+from cvtgs.devices import HOST, thread_count
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.frames import robust_frame
 from cvtgs.math.segments import ascending_rows
@@ -166,21 +166,22 @@ def _nearest_apart(
     """Find the nearest of sites that do not coincide, and their squared distances."""
     if sites.device.type == "cuda":
         return nearest_in_tiles(points, sites, count)
-    ranks, parts = [*range(1, count + 1)], row_chunks(len(points), CHUNK, HOST)
+    ranks, starts = [*range(1, count + 1)], range(0, len(points), CHUNK)
     rows = np.empty((len(points), count), dtype=np.int64)
     squared = np.empty((len(points), count), dtype=np.float64)
     try:
         tree = build_tree(sites)
 
-        def search(part: slice) -> None:
+        def search(start: int) -> None:
+            part = slice(start, start + CHUNK)
             distances, rows[part] = tree.query(points[part].double().numpy(), k=ranks)
             np.square(distances, out=squared[part])
 
-        if len(parts) == 1:
-            search(parts[0])
+        if len(starts) == 1:
+            search(0)
         else:  # in threads of our own: an interrupt would leave scipy's running
             with ThreadPoolExecutor(thread_count()) as pool:
-                list(pool.map(search, parts))
+                list(pool.map(search, starts))
     except ValueError as error:
         raise InvalidArgumentError(
             "points and sites must be finite, found NaN or infinite coordinates."
