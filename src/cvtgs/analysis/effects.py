@@ -113,9 +113,6 @@ def plan_effects(
         config: Overrides of the decisions, and the thresholds of the filter; None for the
             defaults.
 
-    Returns:
-        The plan.
-
     Raises:
         InvalidArgumentError: Tensors have different lengths.
 

@@ -64,13 +64,8 @@ def nearest_scipy(
 
     Points along a space-filling curve take half the time of shuffled ones. The tree is on the
     host: positions from another device are copied there, and the result back. Memory: ``16 n``
-    bytes for the result, and a chunk of points in float64.
-
-    Returns:
-        As :func:`nearest_site`.
-
-    Raises:
-        InvalidArgumentError: As for :func:`nearest_site`.
+    bytes for the result, and a chunk of points in float64. Results and errors are those of
+    :func:`nearest_site`.
 
     Example:
         >>> labels, squared = nearest_scipy(torch.tensor([[0.9]]), torch.tensor([[0.0], [1.0]]))
