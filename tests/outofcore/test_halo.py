@@ -172,7 +172,7 @@ def test_sites_move_as_in_one_piece(job):
     points = of_all(job, "sample", "points")
     weights = of_all(job, "sample", "weights")
     sites = of_all(job, "sites", "sites", 0)
-    moves = len(list(job.path("").glob("sites_*_00000"))) - 1
+    moves = len(list(job.path("").glob("sites_00000_*"))) - 1
     assert moves == job.config.cvt.iterations
     whole = cvt.lloyd(
         points, weights, sites, nearest=cvt.nearest_scipy, iterations=moves, tolerance=0.0
@@ -190,7 +190,7 @@ def test_gaussians_go_to_cells_of_other_blocks(job):
     assert (len(sizes), int(sizes.amin())) == (TARGET, 1)
     blocks = job.blocks_with_cells()
     members = sum(int(read_cells(job, block).partition.counts.sum()) for block in blocks)
-    rows = sum(job.rows_path(block, 0).stat().st_size for block in blocks)
+    rows = sum(job.path("rows", block, 0).stat().st_size for block in blocks)
     assert rows % members == 0  # every Gaussian is in one cell
     assert members <= scan.row_count
 

@@ -34,7 +34,7 @@ def job_on_a_line(tmp_path, monkeypatch):
             range_rows=1,
         )
         counts = tuple(len(sites) for _, sites in blocks)
-        manifest = Manifest(key="", grouped=9, total=1, cells=counts, left_out_mass=0.0)
+        manifest = Manifest(grouped=9, total=1, cells=counts, left_out_mass=0.0)
         job.write_file("manifest.json", manifest.to_json().encode())
         for block, (points, sites) in enumerate(blocks):
             positions, weights = torch.tensor(points).T
@@ -70,12 +70,12 @@ def test_a_site_goes_to_the_block_with_most_of_its_weight(job_on_a_line, weight,
     third = ([(9.0, weight), (30.0, 1.0), (30.0, 1.0)], [30.0])
     job = job_on_a_line(OWN, second, third)
     assert moved_sites(job) == wanted
-    before = job.step_path("sites", 0, 1).read_bytes(), job.step_path("sites", 1, 1).read_bytes()
-    job.step_path("sites", 1, 1).unlink()  # as if the run ended before it was written
+    before = job.path("sites", 0, 1).read_bytes(), job.path("sites", 1, 1).read_bytes()
+    job.path("sites", 1, 1).unlink()  # as if the run ended before it was written
     move_sites(job, 0)
     assert (
-        job.step_path("sites", 0, 1).read_bytes(),
-        job.step_path("sites", 1, 1).read_bytes(),
+        job.path("sites", 0, 1).read_bytes(),
+        job.path("sites", 1, 1).read_bytes(),
     ) == before
 
 

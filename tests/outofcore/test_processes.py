@@ -243,7 +243,7 @@ def test_no_process_is_left_behind_and_the_run_continues(source, tmp_path, sign)
         [sys.executable, str(script), str(source), str(output)], stderr=subprocess.DEVNULL
     )
     folder = tmp_path / ".out.ply.blocks"
-    while not list(folder.glob("*/sites_01_*")):
+    while not list(folder.glob("*/sites_*_00001")):
         assert running.poll() is None
         time.sleep(0.01)
     children = psutil.Process(running.pid).children(recursive=True)

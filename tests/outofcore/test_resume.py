@@ -81,12 +81,12 @@ def test_a_killed_run_continues_with_the_missing_blocks(source, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
-@pytest.mark.parametrize("step", ["sums_01", "parts", "groups", "labels", "merged", "inflated"])
+@pytest.mark.parametrize("step", ["sums_*_00001", "parts", "groups", "labels", "merged", "inflated"])
 def test_a_run_killed_between_steps_of_all_blocks_continues(source, tmp_path, step):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
     whole = tmp_path / "whole.ply"
     simplify_file(source, whole, 0.05, blocks=8)
-    assert kill_when(start(source, output), lambda: len(list(folder.glob(f"*/{step}_*"))) >= 3)
+    assert kill_when(start(source, output), lambda: len(list(folder.glob(f"*/{step}*"))) >= 3)
     assert not output.exists()
     names = ("sample", "sites", "sums", "parts", "groups", "labels", "merged", "inflated")
     kept = [name for name in names if (name, step) != ("groups", "groups")]  # all blocks at once

@@ -138,7 +138,7 @@ def test_a_job_with_damaged_views_starts_over(scene, tmp_path):
     job = run(scene, tmp_path, config)
     small = [cvtgs.load(job.small_path(block)) for block in job.blocks_with_cells()]
     job.views_path.write_bytes(b"damaged")
-    job.step_path("contributions", 1).unlink()
+    job.path("contributions", 1).unlink()
     assert finish(tmp_path, config).resumed_blocks == 0
     assert same_bits(cvtgs.load(tmp_path / "out.ply"), concatenate(small))
 
@@ -147,15 +147,15 @@ def test_a_job_with_damaged_views_starts_over(scene, tmp_path):
 def test_damaged_contributions_are_measured_again(scene, tmp_path):
     config = SimplifyConfig.from_mapping(SETTINGS)
     job = run(scene, tmp_path, config)
-    whole = job.step_path("contributions", 1).read_bytes()
-    job.step_path("contributions", 1).write_bytes(whole[:100])
+    whole = job.path("contributions", 1).read_bytes()
+    job.path("contributions", 1).write_bytes(whole[:100])
     for path in tmp_path.glob(".out.ply.blocks/*/sample_*"):
         path.unlink()
     seen = {}
 
     def note(event):
         if event.stage == "assemble":
-            seen["again"] = job.step_path("contributions", 1).read_bytes()
+            seen["again"] = job.path("contributions", 1).read_bytes()
 
     report = finish(tmp_path, config, note)
     assert seen["again"] == whole

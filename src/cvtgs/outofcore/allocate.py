@@ -187,7 +187,7 @@ def join(job: Job, block: int) -> None:
     owners = torch.where(owners == block, -1, owners)
     sent = send_rows(job, block, owners, labels)
     labels = torch.where(owners < 0, labels, -1).int()
-    facts = {SENT_BYTES: str(job.sent_path(block).stat().st_size)}
+    facts = {SENT_BYTES: str(job.path("sent", block).stat().st_size)}
     job.write("labels", block, {"labels": labels, "sent": sent}, facts=facts)
 
 

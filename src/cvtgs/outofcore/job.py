@@ -30,7 +30,7 @@ from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, wr
 SENT_BYTES = "sent_bytes"  # entry of the label file of a block: bytes of the file of its sent rows
 
 
-FILES_VERSION = 10
+FILES_VERSION = 11
 """Number of the layout of these files: raise it with every change, so that no run continues with
 files of another layout."""
 
@@ -51,7 +51,6 @@ Step = Literal[
 class Manifest(Record):
     """Record written once all rows are sorted into blocks; from then on the job can be resumed."""
 
-    key: str  # digest of everything that the result depends on
     grouped: int  # Gaussians that the filter leaves to group
     total: int  # Gaussians that all blocks keep together
     cells: tuple[int, ...]  # of the tessellation in each block; their sum is at least ``total``
@@ -75,30 +74,18 @@ class Job:
     axes: str = SCENE_AXES  # directions of x, y and z in the output
     cameras: Cameras | None = None  # for presets that render the scene; None generates views
 
-    def path(self, name: str) -> Path:
-        """Return the path of a file of the job."""
-        return Path(self.folder) / name
-
-    def rows_path(self, block: int, number: int) -> Path:
-        """Return the file with the rows of one range of the source that lie in a block."""
-        return self.path(f"rows_{block:05d}_{number:05d}")
-
-    def kept_path(self, number: int) -> Path:
-        """Return the file with the protected rows of one range of the source."""
-        return self.path(f"kept_{number:05d}")
-
-    def step_path(self, step: Step, block: int, iteration: int | None = None) -> Path:
-        """Return the file that a step writes for a block; Lloyd writes one per iteration."""
-        nth = "" if iteration is None else f"_{iteration:02d}"
-        return self.path(f"{step}{nth}_{block:05d}")
+    def path(self, name: str, *numbers: int | None, suffix: str = "") -> Path:
+        """Return the path of a file of the job, by its name and numbers such as that of a block."""
+        parts = [name, *(f"{number:05d}" for number in numbers if number is not None)]
+        return Path(self.folder) / ("_".join(parts) + suffix)
 
     def has(self, step: Step, block: int, iteration: int | None = None) -> bool:
-        """Return whether a step is done for a block."""
-        return self.step_path(step, block, iteration).exists()
+        """Return whether a step is done for a block; Lloyd writes a file per iteration."""
+        return self.path(step, block, iteration).exists()
 
     def read(self, step: Step, block: int, iteration: int | None = None) -> dict[str, Tensor]:
         """Map the tensors that a step wrote for a block."""
-        return map_tensors(self.step_path(step, block, iteration))[0]
+        return map_tensors(self.path(step, block, iteration))[0]
 
     def write(
         self,
@@ -110,7 +97,7 @@ class Job:
         facts: Mapping[str, str] | None = None,
     ) -> None:
         """Write the tensors of a step for a block."""
-        save_tensors(self.step_path(step, block, iteration), tensors, facts or {})
+        save_tensors(self.path(step, block, iteration), tensors, facts or {})
 
     def write_file(self, name: str, content: bytes) -> None:
         """Write a file of the job, completely or not at all."""
@@ -121,17 +108,13 @@ class Job:
         """The file of the cameras that all blocks share, and of the sample of the scene."""
         return self.path("views.safetensors")
 
-    def sent_path(self, block: int) -> Path:
-        """Return the file with the rows of a block that belong to remote groups."""
-        return self.path(f"sent_{block:05d}")
-
     def small_path(self, block: int) -> Path:
         """Return the file of a finished block."""
-        return self.path(f"small_{block:05d}.ply")
+        return self.path("small", block, suffix=".ply")
 
     def improved_path(self, block: int) -> Path:
         """Return the file of a finished block that was matched to images or refined."""
-        return self.path(f"improved_{block:05d}.ply")
+        return self.path("improved", block, suffix=".ply")
 
     def finished_path(self, block: int) -> Path:
         """Return the final file of a finished block."""
@@ -150,7 +133,7 @@ class Job:
 
     def report_path(self, block: int) -> Path:
         """Return the file with the report of a finished block."""
-        return self.path(f"small_{block:05d}.json")
+        return self.path("small", block, suffix=".json")
 
     def ranges(self) -> list[RowRange]:
         """Return the ranges of the source."""
@@ -184,7 +167,7 @@ class Job:
         return [
             block
             for block, count in enumerate(self.cells)
-            if count or any(self.rows_path(block, number).exists() for number in numbers)
+            if count or any(self.path("rows", block, number).exists() for number in numbers)
         ]
 
     def read_network(self, dtype: torch.dtype) -> Net | None:
@@ -225,18 +208,16 @@ class Job:
         }
         return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
-    def can_resume(self, key: str) -> bool:
-        """Return whether the folder holds all sorted rows of exactly this job.
-
-        Files of later steps that a failed disk or machine damaged are removed, to be made again.
-        """
+    def can_resume(self) -> bool:
+        """Return whether the folder holds all sorted rows; remove damaged files of later steps."""
         try:
             self.read_scan()
             if self.config.uses_images:
                 map_tensors(self.views_path)
-            if self.read_manifest().key != key or not self.has_sorted_rows():
-                return False
+            self.read_manifest()
         except (OSError, ValueError, KeyError, TypeError):
+            return False
+        if not self.has_sorted_rows():
             return False
         self._remove_damaged()
         return True
@@ -290,7 +271,7 @@ class Job:
                     whole = True
                     if SENT_BYTES in facts:
                         block = int(path.name.removeprefix("labels_"))
-                        whole = self.sent_path(block).stat().st_size == int(facts[SENT_BYTES])
+                        whole = self.path("sent", block).stat().st_size == int(facts[SENT_BYTES])
                 except (CvtgsError, OSError):
                     whole = False
                 if not whole:

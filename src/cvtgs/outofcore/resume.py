@@ -35,8 +35,7 @@ def started(
 ) -> Iterator[None]:
     """Make the folder of a job, unless it resumes; check the workers, and write the network.
 
-    The body sorts the rows. If it fails or the source changes meanwhile, there is nothing to
-    resume, and the folder is removed.
+    The body sorts the rows; if it fails or the source changes meanwhile, the folder is removed.
     """
     before = _stamp(job.source.path)
     try:
@@ -86,14 +85,15 @@ def _stamp(path: str) -> tuple[int, int] | None:
     return stat.st_size, stat.st_mtime_ns
 
 
-def with_earlier_sizes(
-    job: Job, output: str | os.PathLike[str], *, key_of: Callable[[Job], str]
+def in_folder(
+    job: Job, output: str | os.PathLike[str], *, key_of: Callable[[Job], str], adapts: bool
 ) -> Job:
-    """Return a job with the sizes of an interrupted run of it, unless that needs more memory.
+    """Return a job with its folder, which is named by its key: late workers use that of their job.
 
-    Otherwise a run with a little more or less free memory could not continue that one.
+    One that adapts gets the sizes of an interrupted run of it, unless that needs more memory.
     """
-    for path in hidden_path(output, "blocks").glob("*/sizes.json"):
+    parent = hidden_path(output, "blocks")
+    for path in parent.glob("*/sizes.json") if adapts else ():
         try:
             sizes = JobSizes.model_validate_json(path.read_bytes())
         except (OSError, ValueError):
@@ -101,9 +101,10 @@ def with_earlier_sizes(
         earlier = replace(job, **sizes.model_dump())
         fits = earlier.blocks >= job.blocks and earlier.sample_rows <= job.sample_rows
         fits = fits and earlier.cell_room <= job.cell_room
-        if fits and Path(job_folder(output, key_of(earlier))) == path.parent:
-            return earlier
-    return job
+        if fits and key_of(earlier)[:16] == path.parent.name:
+            job = earlier
+            break
+    return replace(job, folder=str(parent / key_of(job)[:16]))
 
 
 def can_continue(output: str | os.PathLike[str]) -> bool:
@@ -118,11 +119,3 @@ def remove_job_files(output: str | os.PathLike[str], *, is_stream: bool = False)
     if is_folder(folder) or is_file(lock_path(locked)):
         with suppress(OutputError), output_lock(locked):
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def job_folder(output: str | os.PathLike[str], key: str) -> str:
-    """Return the folder of a job: named by its key, in a hidden folder beside the output, or in it.
-
-    A worker that still writes for another job of this output therefore cannot write to it.
-    """
-    return str(hidden_path(output, "blocks") / key[:16])

@@ -78,7 +78,7 @@ def read_members(job: Job, block: int) -> tuple[BlockRows, Tensor]:
 def kept_rows(job: Job) -> Iterator[NDArray[Any]]:
     """Map the protected rows of every range, in pieces."""
     for rows in job.ranges():
-        path = job.kept_path(rows.number)
+        path = job.path("kept", rows.number)
         if path.exists():
             table = np.memmap(path, job.source.dtype, "r").view(np.ndarray)
             yield from (table[start : start + CHUNK] for start in range(0, len(table), CHUNK))
@@ -97,7 +97,7 @@ def send_rows(job: Job, block: int, owners: Tensor, labels: Tensor) -> Tensor:
         parts.append(table)
         start += len(rows)
     remote = owners[owners >= 0]
-    with atomic_output(job.sent_path(block), overwrite=True) as file:
+    with atomic_output(job.path("sent", block), overwrite=True) as file:
         order = torch.sort(remote, stable=True).indices
         file.write(np.concatenate(parts)[order.numpy()].tobytes())
     return torch.bincount(remote, minlength=job.blocks)
@@ -111,7 +111,7 @@ def _received(job: Job, block: int) -> Iterator[NDArray[Any]]:
             continue
         sent = job.read("labels", other)["sent"]
         start, count = int(sent[:block].sum()), int(sent[block])
-        yield from _mapped(job.sent_path(other), kind, start, count)
+        yield from _mapped(job.path("sent", other), kind, start, count)
 
 
 def _row_pieces(job: Job, block: int) -> Iterator[NDArray[Any]]:
@@ -122,7 +122,7 @@ def _row_pieces(job: Job, block: int) -> Iterator[NDArray[Any]]:
 
 def _row_files(job: Job, block: int) -> list[tuple[Path, int]]:
     size = record_type(job).itemsize
-    paths = [job.rows_path(block, rows.number) for rows in job.ranges()]
+    paths = [job.path("rows", block, rows.number) for rows in job.ranges()]
     return [(path, path.stat().st_size // size) for path in paths if path.exists()]
 
 

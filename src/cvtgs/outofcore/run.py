@@ -3,7 +3,6 @@
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -45,7 +44,7 @@ from cvtgs.outofcore.memory import (
     warn_of_writing,
 )
 from cvtgs.outofcore.merge import correct, inflate, merge, read_report, simplify_block
-from cvtgs.outofcore.resume import job_folder, started, with_earlier_sizes
+from cvtgs.outofcore.resume import in_folder, started
 from cvtgs.outofcore.rows import kept_rows
 from cvtgs.outofcore.scan import CHUNK, read_sample
 from cvtgs.outofcore.sort import sort_into_blocks
@@ -183,17 +182,15 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         ),
         cameras=cameras if simplifier.config.uses_images else None,
     )
-    if blocks is None:
-        job = with_earlier_sizes(job, output, key_of=lambda job: job.key(simplifier.checkpoint))
-    key = job.key(simplifier.checkpoint)
-    job = replace(job, folder=job_folder(output, key))
+    key_of = partial(Job.key, checkpoint=simplifier.checkpoint)
+    job = in_folder(job, output, key_of=key_of, adapts=blocks is None)
     clock = StageClock(listener, HOST)
     with output_lock(output), without_autocast():
-        resumes = job.can_resume(key)
+        resumes = job.can_resume()
         with started(job, workers, clock, simplifier.checkpoint, resumes=resumes):
             if not resumes:
                 with one_thread():
-                    manifest = _scan_and_sort(job, key, workers, clock)
+                    manifest = _scan_and_sort(job, workers, clock)
                 job.write_file("manifest.json", manifest.to_json().encode())
         energies = _group(job, workers, clock) if job.goes_by_steps else ()
         resumed, is_complete = _run_blocks(job, workers, clock), False
@@ -231,7 +228,7 @@ def check_config(config: SimplifyConfig, *, with_images: bool = True) -> None:
         )
 
 
-def _scan_and_sort(job: Job, key: str, workers: Workers, clock: StageClock) -> Manifest:
+def _scan_and_sort(job: Job, workers: Workers, clock: StageClock) -> Manifest:
     """Scan the file and sort its rows into blocks; return the manifest."""
     found = sort_into_blocks(job, workers, clock)
     total = sum(found.rows)
@@ -244,7 +241,6 @@ def _scan_and_sort(job: Job, key: str, workers: Workers, clock: StageClock) -> M
     else:
         cells = shared_out(finer, found.cells, rooms=found.rows)
     return Manifest(
-        key=key,
         grouped=total,
         total=found.rest,
         cells=tuple(cells),
@@ -331,7 +327,7 @@ def _kept_files(job: Job) -> list[Path]:
     """Write the protected rows in files with the columns and axes of blocks."""
     paths = []
     for number, scene in enumerate(_kept_scenes(job)):
-        paths.append(job.path(f"unchanged_{number:05d}.ply"))
+        paths.append(job.path("unchanged", number, suffix=".ply"))
         save(scene, paths[-1], overwrite=True, axes=job.axes)
     return paths
 

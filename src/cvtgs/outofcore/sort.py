@@ -181,7 +181,7 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
         protected = valid & inside(job.boxes, scene.means)
         if bool(protected.any()):
             kept = _kept_rows(records, scene, protected)
-            attempt.append(job.kept_path(rows.number).name, kept)
+            attempt.append(job.path("kept", rows.number).name, kept)
         free = (valid & ~protected).nonzero()[:, 0]
         chosen, areas, visibility = _filtered(scan, config, scene, free)
         if len(chosen) < len(free):
@@ -203,7 +203,7 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
         ends = added.cumsum(0).tolist()
         for block, (end, count) in enumerate(zip(ends, added.tolist(), strict=True)):
             if count:
-                name = job.rows_path(block, rows.number).name
+                name = job.path("rows", block, rows.number).name
                 attempt.append(name, table[end - count : end].tobytes())
     return SortedCounts(row_counts.tolist(), cell_counts, left_out, [*attempt.files.values()])
 

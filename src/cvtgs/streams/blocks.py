@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -28,7 +28,7 @@ from cvtgs.io.ply import open_rows
 from cvtgs.outofcore import Workers
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.memory import check_memory, chosen_blocks, memory_to_plan, sample_rows
-from cvtgs.outofcore.resume import job_folder, started, with_earlier_sizes
+from cvtgs.outofcore.resume import in_folder, started
 from cvtgs.outofcore.rows import analysis_of, read_rows
 from cvtgs.outofcore.run import check_config, rows_per_range
 from cvtgs.outofcore.sort import sort_into_blocks
@@ -100,7 +100,7 @@ class StreamJob:
 
     def part_path(self, block: int) -> Path:
         """Return the path of the JSON file with the :class:`StreamPart` of a block."""
-        return self.job.path(f"part_{block:05d}.json")
+        return self.job.path("part", block, suffix=".json")
 
     def finished(self, block: int) -> StreamPart | None:
         """Return the written part of a block; None unless all its files are complete."""
@@ -244,10 +244,8 @@ def stream_file(  # noqa: PLR0913 (options by name)
         facts = [job.key(simplifier.checkpoint), targets, choices]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
-    if blocks is None:
-        job = with_earlier_sizes(job, folder, key_of=key_of)
     spec = StreamJob(
-        job=replace(job, folder=job_folder(folder, key_of(job))),
+        job=in_folder(job, folder, key_of=key_of, adapts=blocks is None),
         form=form,
         chunk_gaussians=chunk_gaussians,
         axes=axes,
