@@ -81,7 +81,9 @@ def test_a_killed_run_continues_with_the_missing_blocks(source, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
-@pytest.mark.parametrize("step", ["sums_*_00001", "parts", "groups", "labels", "merged", "inflated"])
+@pytest.mark.parametrize(
+    "step", ["sums_*_00001", "parts", "groups", "labels", "merged", "inflated"]
+)
 def test_a_run_killed_between_steps_of_all_blocks_continues(source, tmp_path, step):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
     whole = tmp_path / "whole.ply"

@@ -3,15 +3,14 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
 from functools import reduce
 from operator import add
 from pathlib import Path
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple
 
 import numpy as np
-import pydantic
 import torch
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
@@ -33,7 +32,7 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.devices import HOST, one_thread
 from cvtgs.grouping import curve_order
 from cvtgs.io.ply import PlyRows
-from cvtgs.io.tensors import map_tensors, save_tensors
+from cvtgs.io.tensors import map_tensors, save_tensors, under_prefix
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.scene import GaussianScene
@@ -46,13 +45,10 @@ class KdPartition:
     axes: Int[Tensor, "k"]  # along which each node splits
     thresholds: Float[Tensor, "k"]  # coordinate of the splitting plane; points below it go left
     children: Int[Tensor, "k 2"]  # left and right; ``-1 - b`` is block b
-    count: int  # of blocks
 
     def blocks_of(self, points: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
         """Return the block of every point."""
-        if self.count == 1:
-            return torch.zeros(len(points), dtype=torch.int64)
-        nodes = torch.zeros(len(points), dtype=torch.int64)
+        nodes = torch.full((len(points),), 0 if len(self.axes) else -1)
         while bool((nodes >= 0).any()):
             inner = nodes.clamp_min(0)
             coordinates = points.gather(1, self.axes[inner][:, None])[:, 0]
@@ -88,7 +84,6 @@ def partition_space(
         axes=torch.tensor(axes, dtype=torch.int64),
         thresholds=torch.tensor(thresholds, dtype=torch.float64),
         children=torch.tensor(children, dtype=torch.int64).reshape(-1, 2),
-        count=count,
     )
 
 
@@ -126,11 +121,7 @@ class RowRange(NamedTuple):
 
 
 class RangeTotals(NamedTuple):
-    """Sums over the valid rows of a range.
-
-    Sums of masses are those of single chunks of rows. Added in order, they give the same bits for
-    any division into ranges.
-    """
+    """Sums over the valid rows of a range; of masses by chunk, since their order changes bits."""
 
     depths: Int[Tensor, "voxels"]  # optical depths (:func:`cvtgs.analysis.analyze.add_depths`)
     masses: tuple[float, ...]  # opacity times mean projected area, squared scene units
@@ -173,10 +164,7 @@ class SceneScan:
 
 
 def read_sample(source: PlyRows, count: int) -> GaussianScene:
-    """Read one of every k Gaussians, about ``count``; return the valid ones.
-
-    Which of the k differs, so that a sample of rows in a periodic order is not one-sided.
-    """
+    """Read one of every k Gaussians, about ``count``; return the valid ones."""
     step = max(1, source.count // count)
     rows = step * max(1, CHUNK // step)
     parts = (
@@ -187,7 +175,7 @@ def read_sample(source: PlyRows, count: int) -> GaussianScene:
 
 
 def _one_of(rows: NDArray[Any], step: int) -> NDArray[Any]:
-    """Return one of every ``step`` rows, each at another place."""
+    """Return one of every ``step`` rows, each at another place: the order may be periodic."""
     firsts = np.arange(0, len(rows), step)
     places = np.floor(np.arange(len(firsts)) * _GOLDEN % 1 * step).astype(np.int64)
     found: NDArray[Any] = rows[np.minimum(firsts + places, len(rows) - 1)]
@@ -201,7 +189,7 @@ def scan_range(
     """Sum optical depths, masses and counts over a range of the source."""
     depths = empty_depth_grid(HOST)
     all_masses, falloff_masses, valid_count, kept_count = list[float](), list[float](), 0, 0
-    far_masses, found = [torch.zeros(0, dtype=torch.float64)], Counter[str]()
+    far_masses, found = list[Tensor](), Counter[str]()
     for start in range(rows.start, rows.stop, CHUNK):
         scene = source.scene(source.read(start, min(start + CHUNK, rows.stop)))
         invalid = validity.invalid_rows(scene)
@@ -257,12 +245,7 @@ def scan_scene(
     config: SimplifyConfig,
     frame: RobustFrame,
 ) -> SceneScan:
-    """Choose filter thresholds, scale of the weights and partition from the sample.
-
-    The filter keeps at least ``target`` Gaussians; ``cell_count`` is at least ``target``. The
-    measure of a block is the mean of its shares of the Gaussians and of their weight, so that no
-    block has more than about twice the average of either.
-    """
+    """Choose filter thresholds that keep the target, scale of the weights and partition."""
     grid = visibility_grid(totals.depths)
     sample = select_columns(sample, config.effects)
     known = analysis.analyze(sample, config)
@@ -291,6 +274,7 @@ def scan_scene(
     weights = weights.clamp_min(mean_weight * config.cvt.weight_floor)
     cell_weight = _cell_weight(weights, cell_count / rows_per_sample)
     shares = in_cells(weights, cell_weight)
+    # So no block has more than about twice the average of Gaussians or of their weight.
     measure = 0.5 / len(shares) + 0.5 * shares / shares.sum()
     return SceneScan(
         frame=frame,
@@ -357,38 +341,26 @@ def _cell_weight(weights: Float[Tensor, "n"], cells: float) -> float:
 
 def write_scan(scan: SceneScan, path: Path) -> None:
     """Write a scan: tensors as they are, other values as JSON, each under its dotted name."""
-    tensors: dict[str, Tensor] = {}
-    texts: dict[str, str] = {}
-
-    def collect(name: str, value: Any) -> None:
-        if is_dataclass(value):
-            for field in fields(value):
-                collect(f"{name}.{field.name}", getattr(value, field.name))
-        elif isinstance(value, Tensor):
-            tensors[name] = value
-        elif isinstance(value, pydantic.BaseModel):
-            texts[name] = value.model_dump_json()
-        else:
-            texts[name] = json.dumps(value)
-
-    collect("scan", scan)
-    save_tensors(path, tensors, texts)
+    values = _named_fields(scan)
+    for name in ("frame", "partition"):
+        values |= _named_fields(values.pop(name), f"{name}.")
+    values["plan"] = scan.plan.model_dump()
+    tensors = {name: value for name, value in values.items() if isinstance(value, Tensor)}
+    others = {name: value for name, value in values.items() if name not in tensors}
+    save_tensors(path, tensors, {"values": json.dumps(others)})
 
 
-_ADAPTERS = {kind: pydantic.TypeAdapter(kind) for kind in (float, int, dict[str, int], EffectPlan)}
+def _named_fields(part: SceneScan | RobustFrame | KdPartition, prefix: str = "") -> dict[str, Any]:
+    return {prefix + field.name: getattr(part, field.name) for field in fields(part)}
 
 
 def read_scan(path: Path) -> SceneScan:
     """Read a scan that :func:`write_scan` wrote."""
-    scan: SceneScan = _build("scan", SceneScan, *map_tensors(path))
-    return scan
-
-
-def _build(name: str, kind: Any, tensors: Mapping[str, Tensor], texts: Mapping[str, str]) -> Any:
-    """Build a value from its parts; a recursive closure instead would keep the file mapped."""
-    if kind in _ADAPTERS:
-        return _ADAPTERS[kind].validate_json(texts[name])
-    kinds = get_type_hints(kind) if is_dataclass(kind) else {}
-    if not kinds:
-        return tensors[name]
-    return kind(**{key: _build(f"{name}.{key}", kinds[key], tensors, texts) for key in kinds})
+    tensors, texts = map_tensors(path)
+    values = {**tensors, **json.loads(texts["values"])}
+    parts = {
+        "frame": RobustFrame(**under_prefix("frame.", values)),
+        "partition": KdPartition(**under_prefix("partition.", values)),
+        "plan": EffectPlan.model_validate(values.pop("plan")),
+    }
+    return SceneScan(**{name: one for name, one in values.items() if "." not in name}, **parts)
