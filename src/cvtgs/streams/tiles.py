@@ -26,6 +26,7 @@ from cvtgs.io.gltf.document import AXES, SPLATS, SPZ
 from cvtgs.io.limits import FORMAT_LIMITS, clamped_within, dropped_within
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import rms_error
+from cvtgs.scene import GaussianScene
 from cvtgs.streams.files import StreamLevel, StreamPart, join_trees, write_stream
 from cvtgs.streams.plan import StreamNode, StreamPlan, box_of, join_boxes
 from cvtgs.text import shown
@@ -65,47 +66,39 @@ class TilesFormat:
     def write_part(
         self, plan: StreamPlan, folder: Path, *, part: int, listener: ProgressListener
     ) -> StreamPart:
-        """Write the tiles of a part; the first holds the coarsest level of the whole part.
-
-        Boxes enclose what files hold, which may be less than the plan has: they clamp flyaways.
-        """
-        limits = FORMAT_LIMITS[".spz.glb"]
+        """Write the tiles of a part; the first holds the coarsest level of the whole part."""
         root = _tiles(plan, self.tile_gaussians)
-        tiles = list(_listed(root))
-        names = {id(tile): f"{part}_{number}.glb" for number, tile in enumerate(tiles)}
+        total, names, dropped = _count(root), list[str](), Counter[str]()
         counts, files, sizes = ([0] * len(plan.levels) for _ in range(3))
-        origins: dict[int, Corner] = {}
-        boxes: dict[int, tuple[Corner, Corner]] = {}
-        dropped = Counter[str]()
-        for number, tile in enumerate(tiles):
-            scene = plan.levels[tile.level].scene
+
+        def write(tile: _Tile) -> tuple[dict[str, Any], tuple[Corner, Corner]]:
+            """Write a tile and the finer ones; return their entry, and the box of all."""
+            names.append(f"{part}_{len(names)}.glb")
+            path, scene = folder / names[-1], plan.levels[tile.level].scene
             rows = _rows(plan, tile)
-            some = tagged_if_flat(scene.select(rows.to(scene.device)))
-            means = some.means.detach().double()
-            origins[id(tile)] = _median(means)
-            tensors = {**some.tensors(), "means": means - means.new_tensor(origins[id(tile)])}
-            local = some.with_tensors({name: one.float() for name, one in tensors.items()})
-            turned = change_axes(local, SCENE_AXES, AXES)
-            path = folder / names[id(tile)]
-            with np.errstate(over="ignore"), atomic_output(path, overwrite=True) as file:
-                write_spz_glb(turned, file)
-            dropped.update(dropped_within(turned, limits))
-            held = clamped_within(local.with_sh_degree(0), limits)  # boxes need no more
-            boxes[id(tile)] = box_of(held, origins[id(tile)])
+            origin, own_box, lost = _write_tile(scene.select(rows.to(scene.device)), path)
+            dropped.update(lost)
             counts[tile.level] += len(rows)
             files[tile.level] += 1
             sizes[tile.level] += path.stat().st_size
-            listener(ProgressEvent(stage="write", done=number + 1, total=len(tiles)))
-        for tile in reversed(tiles):  # children first
-            inner = [boxes[id(child)] for child in tile.children]
-            boxes[id(tile)] = join_boxes([boxes[id(tile)], *inner])
-        box_min, box_max = boxes[id(root)]
-        located = {tile: _located(*box, origins[tile]) for tile, box in boxes.items()}
+            listener(ProgressEvent(stage="write", done=len(names), total=total))
+            content = {"uri": path.name}
+            finer = [write(child) for child in tile.children]
+            box = join_boxes([own_box, *(child_box for _, child_box in finer)])
+            entry = {**_located(*box, origin), "geometricError": 0.0, "content": content}
+            if finer:
+                below = [child for child, _ in finer]
+                errors = [child["geometricError"] for child in below]  # never above the parent's
+                entry["geometricError"] = max(ERROR_PIXELS * _error(plan, tile), *errors)
+                entry["children"] = below
+            return entry, box
+
+        tree, (box_min, box_max) = write(root)
         return StreamPart(
             levels=tuple(map(StreamLevel, counts, files, sizes)),
             chunks=len(plan.chunks),
-            names=tuple(names.values()),
-            tree=_entry(plan, root, names, located),
+            names=tuple(names),
+            tree=tree,
             box_min=box_min,
             box_max=box_max,
             dropped=dropped,
@@ -295,27 +288,25 @@ def _leaves(node: StreamNode) -> int:
     return 1 if node.chunk is not None else sum(_leaves(child) for child in node.children)
 
 
-def _listed(tile: _Tile) -> Iterator[_Tile]:
-    yield tile
-    for child in tile.children:
-        yield from _listed(child)
+def _count(tile: _Tile) -> int:
+    return 1 + sum(map(_count, tile.children))
 
 
-def _entry(
-    plan: StreamPlan, tile: _Tile, names: dict[int, str], located: dict[int, dict[str, Any]]
-) -> dict[str, Any]:
-    """Return a tile, with its box and transform of :func:`_located`."""
-    entry: dict[str, Any] = {
-        **located[id(tile)],
-        "geometricError": 0.0,
-        "content": {"uri": names[id(tile)]},
-    }
-    if tile.children:
-        below = [_entry(plan, child, names, located) for child in tile.children]
-        errors = [child["geometricError"] for child in below]  # never larger than that of a parent
-        entry["geometricError"] = max(ERROR_PIXELS * _error(plan, tile), *errors)
-        entry["children"] = below
-    return entry
+def _write_tile(
+    scene: GaussianScene, path: Path
+) -> tuple[Corner, tuple[Corner, Corner], dict[str, int]]:
+    """Write Gaussians about their median; return it, the box of the file, and lost data."""
+    some = tagged_if_flat(scene)
+    means = some.means.detach().double()
+    origin = _median(means)
+    tensors = {**some.tensors(), "means": means - means.new_tensor(origin)}
+    local = some.with_tensors({name: one.float() for name, one in tensors.items()})
+    turned = change_axes(local, SCENE_AXES, AXES)
+    with np.errstate(over="ignore"), atomic_output(path, overwrite=True) as file:
+        write_spz_glb(turned, file)
+    limits = FORMAT_LIMITS[".spz.glb"]
+    held = clamped_within(local.with_sh_degree(0), limits)  # flyaways; boxes need no colours
+    return origin, box_of(held, origin), dropped_within(turned, limits)
 
 
 def _error(plan: StreamPlan, tile: _Tile) -> float:
