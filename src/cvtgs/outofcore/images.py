@@ -27,7 +27,9 @@ from cvtgs.analysis.analyze import measured_areas, visibility_cameras
 from cvtgs.analysis.effects import drop_mip_tag, select_columns
 from cvtgs.boxes import inside
 from cvtgs.cameras import Cameras
+from cvtgs.clock import join_costs
 from cvtgs.config import SimplifyConfig
+from cvtgs.config.base import Record
 from cvtgs.devices import one_thread
 from cvtgs.edit import concatenate
 from cvtgs.errors import without_warnings
@@ -68,7 +70,9 @@ def write_views(job: Job, sample: GaussianScene, *, total: int) -> None:
     if job.cameras is None:
         positions = find_view_positions(sample)
         for name, views in _views_from(positions, job.config, sharp=True).items():
-            contents |= add_prefix(name, _packed(views))
+            size = torch.tensor([views.width, views.height])
+            packed = {"viewmats": views.viewmats, "Ks": views.Ks, "size": size}
+            contents |= add_prefix(name, packed)
             if name == SEEN:
                 warn_of_near_plane(sample, views.singles(), name="the scene")
     save_tensors(job.views_path, contents, {})
@@ -86,11 +90,6 @@ def _views_from(
         later = later_views(config)
         found[LATER] = make(later, size=config.refine.size, seed=seed + LATER_SEED)
     return found
-
-
-def _packed(cameras: Cameras) -> dict[str, Tensor]:
-    size = torch.tensor([cameras.width, cameras.height])
-    return {"viewmats": cameras.viewmats, "Ks": cameras.Ks, "size": size}
 
 
 def _scene_views(job: Job) -> dict[str, Cameras]:
@@ -150,22 +149,16 @@ def read_apparent_rows(job: Job, block: int, *, is_slim: bool = True) -> BlockRo
 
 
 class Drawn(NamedTuple):
-    """The scenes that are rendered while a block is improved: its simplified and full Gaussians.
-
-    Both begin with ``fixed`` others: protected ones, and the simplified ones of other blocks.
-    """
+    """A block, simplified and full, after protected Gaussians and simplified ones of others."""
 
     small: GaussianScene
     full: GaussianScene
-    fixed: int
+    fixed: int  # number of the others
 
 
 @one_thread()
 def improve(job: Job, block: int) -> None:
-    """Match a simplified block to images and refine it; other blocks are rendered unimproved.
-
-    A block that fewer than two of the given cameras show stays as it is.
-    """
+    """Match a block to images and refine it, unless fewer than two given cameras show it."""
     if job.improved_path(block).exists():
         return
     own, found, config = load(job.small_path(block)), read_cells(job, block), job.config
@@ -210,10 +203,9 @@ def improve(job: Job, block: int) -> None:
 def _allocate_again(
     job: Job, drawn: Drawn, own: GaussianScene, found: BlockCells, observed: ObservedViews
 ) -> tuple[GaussianScene, BlockCells, dict[str, Any]]:
-    """Group the members of a block into cells again, with more of them where its images err.
+    """Group a block into cells again, more where its images err; also return changes of its report.
 
-    This is what a run in one piece does with given cameras. The new cells stay within the block, so
-    blocks do not wait for each other. Also return what changes in its report.
+    Unlike in one piece, the new cells stay within the block, so blocks do not wait for each other.
     """
     scene, pixels = found.scene, observed.contributions[drawn.fixed :]
     if not bool(pixels.any()):
@@ -261,10 +253,7 @@ def _choose_views(job: Job, drawn: Drawn) -> tuple[Cameras | None, Cameras | Non
 
 
 def has_fine_views(config: SimplifyConfig, count: int) -> bool:
-    """Return whether images of the whole scene have enough pixels for the Gaussians that are kept.
-
-    Then blocks use the views of a run in one piece. Otherwise, views of a block show more of it.
-    """
+    """Return whether images of the whole scene have enough pixels; else blocks need their own."""
     size = config.visibility.size if config.uses_renders else config.refine.size
     return size**2 >= PIXELS_EACH * count
 
@@ -327,35 +316,27 @@ def _near(means: Float[Tensor, "n 3"], own: Float[Tensor, "m 3"]) -> Tensor:
 
 def join_matchings(reports: Sequence[MatchReport]) -> MatchReport:
     """Combine the reports of all blocks: sums of views, means of PSNR."""
-    return MatchReport(
-        views=sum(report.views for report in reports),
-        heldout=sum(report.heldout for report in reports),
-        opacities_kept=all(report.opacities_kept for report in reports),
-        psnr_before=mean(report.psnr_before for report in reports),
-        psnr_after=mean(report.psnr_after for report in reports),
-        backend=reports[0].backend,
-    )
+    joined = _joined(reports, sums=("views", "heldout"), means=("psnr_before", "psnr_after"))
+    joined["opacities_kept"] = all(report.opacities_kept for report in reports)
+    return reports[0].model_copy(update=joined)
 
 
 def join_refinements(reports: Sequence[RefineReport]) -> RefineReport:
     """Combine the reports of all blocks: sums of steps, views and seconds, means of PSNR."""
     stops = {report.stopped for report in reports}
-    cost = reports[0].cost
-    return RefineReport(
-        steps=sum(report.steps for report in reports),
-        images=sum(report.images for report in reports),
-        heldout=sum(report.heldout for report in reports),
-        psnr_before=mean(report.psnr_before for report in reports),
-        psnr_after=mean(report.psnr_after for report in reports),
-        gain=mean(report.gain for report in reports),
-        changed_count=sum(report.changed_count for report in reports),
-        stopped=stops.pop() if len(stops) == 1 else "steps",
-        backend=reports[0].backend,
-        device=reports[0].device,
-        cost=cost.model_copy(
-            update={
-                "seconds": sum(report.cost.seconds for report in reports),
-                "cpu_seconds": sum(report.cost.cpu_seconds for report in reports),
-            }
-        ),
+    joined = _joined(
+        reports,
+        sums=("steps", "images", "heldout", "changed_count"),
+        means=("psnr_before", "psnr_after", "gain"),
     )
+    joined["stopped"] = stops.pop() if len(stops) == 1 else "steps"
+    (joined["cost"],) = join_costs(report.cost for report in reports)
+    return reports[0].model_copy(update=joined)
+
+
+def _joined(
+    reports: Sequence[Record], *, sums: Sequence[str], means: Sequence[str]
+) -> dict[str, Any]:
+    columns = {name: [getattr(report, name) for report in reports] for name in (*sums, *means)}
+    totals = {name: sum(columns[name]) for name in sums}
+    return totals | {name: mean(columns[name]) for name in means}

@@ -51,10 +51,7 @@ class SortedFile(NamedTuple):
 
 
 class Attempt:
-    """The files that one call writes for a range; every other call for it writes other files.
-
-    Therefore a worker that was presumed dead but still writes cannot damage the files in use.
-    """
+    """The files that one call writes for a range; no other call does, even after a lost worker."""
 
     def __init__(self, folder: str) -> None:
         self.files = dict[str, SortedFile]()  # by final name
@@ -103,10 +100,7 @@ def sort_into_blocks(
 def _scan(
     job: Job, workers: Workers, ranges: Sequence[RowRange], advance: Callable[[int], None]
 ) -> tuple[int, SceneScan]:
-    """Return the number of Gaussians that all blocks keep, and the scan of the scene.
-
-    The sample is freed on return.
-    """
+    """Return the number of Gaussians that all blocks keep, and the scan of the scene."""
     sample = read_sample(job.source, job.sample_rows)
     if len(sample) == 0:
         raise InvalidSceneError(f"{job.source.path}: found no valid Gaussian.")
@@ -157,14 +151,11 @@ def _sort(
 
 
 class SortedCounts(NamedTuple):
-    """The contribution of a range of the source to every block; see :class:`SortedBlocks`.
-
-    Weights and masses are those of single chunks of rows.
-    """
+    """The contribution of a range of the source to every block; see :class:`SortedBlocks`."""
 
     rows: list[int]
-    cells: list[list[float]]
-    left_out: list[float]
+    cells: list[list[float]]  # of each chunk of rows
+    left_out: list[float]  # likewise
     files: list[SortedFile]
 
 
