@@ -30,10 +30,7 @@ KEY = 1 << 32  # a global key of a cell or group is its block times this, plus i
 def cell_parts(
     job: Job, rows: BlockRows, owners: Int[Tensor, "n"], labels: Int[Tensor, "n"], count: int
 ) -> dict[str, Tensor]:
-    """Return the part of a cell that each Gaussian of a block belongs to, and all parts' moments.
-
-    Parts are numbered by :func:`number_remote`; ``owners``, ``labels`` and ``count`` are as there.
-    """
+    """Return the part of a cell, as :func:`number_remote` does, of each Gaussian, and moments."""
     parts, remote = number_remote(owners, labels, count)
     components = job.read_scan().view_components
     members = _members(job, rows, components)
@@ -169,10 +166,7 @@ def _cells_of_parts(block: int, parts: Mapping[str, Tensor]) -> tuple[Tensor, Te
 
 @one_thread()
 def join(job: Job, block: int) -> None:
-    """Write the group of every Gaussian of a block, and the rows that belong to remote groups.
-
-    Each group keeps the best-fitting Gaussian of its own block, so no group becomes empty.
-    """
+    """Write the group of every Gaussian of a block, and the rows that belong to remote groups."""
     if job.has("labels", block):
         return
     tensors = job.read("parts", block)
@@ -202,14 +196,8 @@ def _reassigned(
     neighbors = torch.arange(len(keys))[:, None].repeat(1, len(near))
     neighbors[torch.searchsorted(keys, used)] = torch.searchsorted(keys, near.T.contiguous())
     labels = torch.searchsorted(keys, found)
-    labels = cells.reassign(
-        members,
-        labels,
-        groups,
-        neighbors,
-        _costs(job),
-        must_stay=keys // KEY == block,
-    )
+    own = keys // KEY == block  # these keep their best-fitting member, so none becomes empty
+    labels = cells.reassign(members, labels, groups, neighbors, _costs(job), must_stay=own)
     moved: Tensor = keys[labels]
     return moved
 

@@ -92,10 +92,7 @@ def assign_points(
     *,
     nearest: NearestSite,
 ) -> Assignment:
-    """Find the nearest site of every point among the sites of all blocks.
-
-    A point is searched in another block only if that block's box is nearer than its best site.
-    """
+    """Find the nearest site of every point among the sites of all blocks."""
     if len(sites):
         labels, squared = nearest(points, sites)
     else:
@@ -118,10 +115,9 @@ def assign_points(
 def number_remote(
     owners: Int[Tensor, "n"], labels: Int[Tensor, "n"], count: int
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "r 2"]]:
-    """Number the remote sites or cells of a block's points after its ``count`` own ones.
+    """Number the remote sites of points after the own ones; also return their blocks and numbers.
 
-    ``owners`` are their blocks, -1 for this one, and ``labels`` their numbers there. Also returns
-    block and number of each remote one.
+    ``owners`` are the blocks of sites, -1 for the own one, and ``labels`` their numbers there.
     """
     away = (owners >= 0).nonzero()[:, 0]
     pairs = torch.stack([owners[away], labels[away]], dim=1)

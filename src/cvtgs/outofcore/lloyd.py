@@ -36,10 +36,7 @@ class RemoteSums(NamedTuple):
 
 @one_thread()
 def seed(job: Job, block: int) -> None:
-    """Choose the first sites of a block, and the points that Lloyd samples.
-
-    A block without cells gets neither; its Gaussians join cells of other blocks.
-    """
+    """Choose the first sites of a block, if it has cells, and the points that Lloyd samples."""
     if job.has("sites", block, 0) and job.has("sample", block):
         return
     order, points, weights = _embedded_rows(job, block)
@@ -75,10 +72,7 @@ def accumulate(job: Job, iteration: int, block: int) -> float:
 
 
 def move_sites(job: Job, iteration: int) -> None:
-    """Move the sites of all blocks to their centroids; memory: one block and all remote sums.
-
-    A site that only has points of other blocks becomes a site of one of these.
-    """
+    """Move the sites of all blocks to their centroids; memory: one block and all remote sums."""
     blocks = job.blocks_with_sites()
     left = [block for block in blocks if not job.has("sites", block, iteration + 1)]
     if not left:
@@ -119,9 +113,8 @@ def _change_blocks(
 ) -> tuple[dict[int, list[int]], dict[int, list[Tensor]]]:
     """Choose the sites that change blocks: numbers that leave, and centroids that arrive.
 
-    A site without points of its block goes to the block with most of its weight; there,
-    :func:`assign` need not add a point to its cell, which may be far away. Each block keeps a
-    site, and gets fewer sites than it has points.
+    A site without points of its block goes to the one with most of its weight, where
+    :func:`assign` need not add a far one. Blocks keep a site, and get fewer than they have points.
     """
     leaving: dict[int, list[int]] = {block: [] for block in remote}
     arriving: dict[int, list[Tensor]] = {block: [] for block in remote}
@@ -144,10 +137,7 @@ def _change_blocks(
 
 @one_thread()
 def assign(job: Job, iterations: int, block: int) -> None:
-    """Write the cell of every Gaussian of a block, and the moments of its part of each cell.
-
-    Every own site keeps at least one Gaussian of the block, so no cell is empty.
-    """
+    """Write the cell of every Gaussian of a block, and the moments of its part of each cell."""
     if job.has("parts", block):
         return
     order = job.read("sample", block)["order"]
@@ -199,10 +189,9 @@ def _assign(job: Job, iteration: int, block: int, points: Tensor) -> tuple[Tenso
 def _fill_empty(
     found: Assignment, points: Tensor, sites: Tensor, weights: Tensor
 ) -> tuple[Assignment, int]:
-    """Assign a point of the block to every own site without one; also return their number.
+    """Assign the nearest spare point of the block to own sites without one; return their number.
 
-    Each gets the nearest point that its cell can spare. Unlike in one piece, it may have points of
-    other blocks, so a far point, such as the costliest one, would make a huge cell.
+    They may have points of other blocks, so a far point, such as the costliest, makes a huge cell.
     """
     count = len(sites)
     if count == len(points):  # then all points are seeds, in the same order

@@ -54,11 +54,7 @@ def read_bytes(text: str) -> int:
 
 
 def available_memory() -> int:
-    """Return the bytes of memory that this process may still use.
-
-    This is the minimum of the free memory of the machine, the memory left in the control groups
-    (versions 1 and 2) of a container or a job, and the limit of the process (``ulimit -v``).
-    """
+    """Return the bytes that machine, control groups and ``ulimit -v`` still leave this process."""
     import psutil  # noqa: PLC0415 (loaded when it is used)
 
     rooms: list[int] = [psutil.virtual_memory().available, *control_group_rooms(Path("/"))]
@@ -96,10 +92,8 @@ def warn_of_writing(
 
 
 def memory_to_plan() -> int:
-    """Return the default memory to plan with: the free memory, but at least ``LEAST_BYTES``.
-
-    Estimates are twice the actual use, so planning with less would only give more blocks.
-    """
+    """Return the default memory to plan with."""
+    # Estimates are twice the actual use, so planning with less would only give more blocks.
     return max(available_memory(), LEAST_BYTES)
 
 
@@ -160,35 +154,27 @@ def sample_rows(memory: int) -> int:
 
 
 def needed_memory(source: PlyRows, rows: int, *, merging: int = 0) -> int:
-    """Estimate the bytes needed to simplify some rows at once.
-
-    Measured without view-dependent colour (``python -m benchmarks.memory``): 410 bytes per Gaussian
-    at rho 0.01, 630 where pairs merge from single Gaussians; with degree 3, 450 and 860.
-    """
+    """Estimate the bytes needed to simplify some rows at once."""
+    # Measured without view-dependent colour (python -m benchmarks.memory): 410 bytes per Gaussian
+    # at rho 0.01, 630 where pairs merge from single Gaussians; with degree 3, 450 and 860.
     return BASE_BYTES + rows * (290 + 2 * source.dtype.itemsize) + merging * MERGING_BYTES
 
 
 def cell_room(memory: int | None) -> int:
-    """Return how many cells of the tessellation may merge together in this memory.
-
-    It is rounded down to three binary digits, so that the result does not depend on every byte.
-    """
+    """Return how many cells of the tessellation may merge together in this memory."""
     if memory is None:
         return CELL_ROOM
     room = max(0, memory - base_bytes(memory)) // CELL_BYTES
-    dropped = max(0, room.bit_length() - 3)
+    dropped = max(0, room.bit_length() - 3)  # so that the result does not depend on every byte
     return room >> dropped << dropped
 
 
 def block_count(source: PlyRows, memory: int, *, merging: int = 0) -> int:
-    """Choose the number of blocks, so that any one of them fits: 1, or a multiple of SHARED_BY.
-
-    A block holds at most twice the mean number of rows (:func:`cvtgs.outofcore.scan.scan_scene`).
-    """
+    """Choose the number of blocks, so that any one of them fits: 1, or a multiple of SHARED_BY."""
     base = min(BASE_BYTES, base_bytes(memory))
     if base + needed_memory(source, source.count, merging=merging) - BASE_BYTES <= memory:
         return 1
-    wanted = needed_memory(source, source.count) - BASE_BYTES
+    wanted = needed_memory(source, source.count) - BASE_BYTES  # blocks have at most twice the mean
     room = (memory if memory > base else LEAST_BYTES) - base
     return SHARED_BY * math.ceil(2 * wanted / room / SHARED_BY)
 
@@ -203,9 +189,5 @@ def chosen_blocks(
 
 
 def worker_count(memory: int, wanted: int | None) -> int:
-    """Choose the number of processes that work on blocks: one per core, if none is wanted.
-
-    There is at most one per GB (1.3 GB with the CUDA build of torch), which torch and a block of
-    some size need; on Windows at most 61.
-    """
+    """Choose the number of processes: as wanted or one per core, if the memory is enough."""
     return pool_size(max(1, min(wanted or core_count(), memory // WORKER_BYTES)))

@@ -163,10 +163,7 @@ def simplify_block(job: Job, block: int) -> None:
 def reduce_rows(
     job: Job, rows: BlockRows, target: int, *, importance: Float[Tensor, "n"] | None = None
 ) -> Reduced:
-    """Simplify rows, which the sort has filtered, like a scene of their own.
-
-    ``importance`` is that of :func:`cvtgs.pipeline.reduce_scene`.
-    """
+    """Simplify rows, which the sort has filtered, like a scene of their own."""
     scene = select_columns(rows.scene, job.config.effects)
     no_filter = {"min_opacity": 0.0, "max_flyaway_share": 0.0}
     filter_config = job.config.filter.model_copy(update=no_filter)

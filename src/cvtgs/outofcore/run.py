@@ -210,18 +210,14 @@ def rows_per_range(count: int) -> int:
 
 
 def check_config(config: SimplifyConfig, *, with_images: bool = True) -> None:
-    """Raise if a configuration cannot be applied block by block.
-
-    That is one with images where there are none, or with a refinement for a time in seconds, which
-    would give different bits in every run.
-    """
+    """Raise if a configuration cannot be applied block by block."""
     if not with_images and config.uses_images:
         raise ConfigError(
             "streams in blocks need a preset without images of the scene (draft, fast, standard, "
             f"paper) and no refinement; found {config.preset!r} with {config.visibility.views} "
             f"views and {config.refine.steps} steps of refinement."
         )
-    if config.refine.seconds:
+    if config.refine.seconds:  # every run would give other bits
         raise ConfigError(
             "blocks are refined for a number of steps (--refine-steps, refine.steps), not "
             f"of seconds; found {config.refine.seconds:g} s."
@@ -266,8 +262,7 @@ def _run_blocks(job: Job, workers: Workers, clock: StageClock) -> int:
 def _group(job: Job, workers: Workers, clock: StageClock) -> tuple[float, ...]:
     """Group the Gaussians of all blocks into cells; return the energy before every iteration.
 
-    Each step runs for all blocks before the next, so the result has no seams: the sites of Lloyd
-    move together, cells merge across block borders, and neighbours come from the whole scene.
+    Each step runs for all blocks before the next, so the result has no seams.
     """
     blocks, iterations = job.blocks_with_rows(), job.config.cvt.iterations
     if job.config.uses_renders:
@@ -301,12 +296,16 @@ def assemble_blocks(
 ) -> None:
     """Write the protected rows and then all blocks."""
     blocks = [job.finished_path(block) for block in job.blocks_with_cells()]
-    if is_plain_ply(output):
-        with atomic_output(output, overwrite=overwrite) as file:
-            join_plys([*_kept_files(job), *blocks], file)
+    if not is_plain_ply(output):
+        scene = concatenate([*_kept_scenes(job), *map(load, blocks)])
+        save(scene, output, overwrite=overwrite, axes=axes)
         return
-    scene = concatenate([*_kept_scenes(job), *map(load, blocks)])
-    save(scene, output, overwrite=overwrite, axes=axes)
+    kept = []
+    for number, scene in enumerate(_kept_scenes(job)):
+        kept.append(job.path("unchanged", number, suffix=".ply"))
+        save(scene, kept[-1], overwrite=True, axes=job.axes)
+    with atomic_output(output, overwrite=overwrite) as file:
+        join_plys([*kept, *blocks], file)
 
 
 def is_plain_ply(output: str | os.PathLike[str]) -> bool:
@@ -321,15 +320,6 @@ def _kept_scenes(job: Job) -> Iterator[GaussianScene]:
     for rows in kept_rows(job):
         scene = job.source.scene(rows)
         yield restore_columns(select_columns(scene, job.config.effects), scene, plan)
-
-
-def _kept_files(job: Job) -> list[Path]:
-    """Write the protected rows in files with the columns and axes of blocks."""
-    paths = []
-    for number, scene in enumerate(_kept_scenes(job)):
-        paths.append(job.path("unchanged", number, suffix=".ply"))
-        save(scene, paths[-1], overwrite=True, axes=job.axes)
-    return paths
 
 
 def report_blocks(

@@ -26,19 +26,9 @@ POWER = 0.75  # of the factors on weights; below 1, since cells of blocks end at
 def block_shares(
     job: Job, ratios: Sequence[float], weights: Sequence[float], *, sh_degree: int | None
 ) -> list[list[float]]:
-    """Estimate the share of each block in the cells of each level, in any unit.
+    """Estimate the share of each block in the cells of levels with these ratios, in any unit.
 
-    A sample of the whole scene is grouped as a scene in one piece, so blocks where merging costs
-    more have more cells. Where few cells of the sample are expected, weights count more.
-
-    Args:
-        job: The job; its scan must be written.
-        ratios: Share of the Gaussians that each level keeps.
-        weights: Weight of each block.
-        sh_degree: Highest SH degree to keep; None keeps all.
-
-    Returns:
-        The shares of all blocks, for each ratio.
+    A sample is grouped as a scene in one piece, so blocks where merging costs more have more cells.
     """
     sample = read_sample(job.source, SAMPLED)
     if job.blocks == 1 or len(sample) == 0:
