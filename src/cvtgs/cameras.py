@@ -103,13 +103,7 @@ class Cameras:
         """Return some of the cameras, as ``cameras[rows]`` does.
 
         Args:
-            rows: A slice, indices of the cameras, or a mask.
-
-        Returns:
-            The selected cameras.
-
-        Raises:
-            InvalidArgumentError: A mask has not one entry per camera, or an index is out of range.
+            rows: A slice, indices of the cameras, or a mask with one entry per camera.
         """
         device = rows.device if isinstance(rows, Tensor) else torch.device("cpu")
         chosen = row_numbers(rows, len(self), things="cameras", device=device)
@@ -123,43 +117,18 @@ class Cameras:
     __getitem__ = select
 
     def singles(self) -> list[Self]:
-        """Split into single cameras.
-
-        Returns:
-            One :class:`Cameras` per camera, in order.
-        """
+        """Return one :class:`Cameras` per camera, in order."""
         if len(self) == 1:  # a selection would copy the row number to the device
             return [self]
         return [self[[row]] for row in range(len(self))]
 
     def to(self, device: torch.device | str) -> Self:
-        """Move the cameras to a device.
-
-        Args:
-            device: The target device.
-
-        Returns:
-            The cameras on that device.
-
-        Raises:
-            DeviceError: The device cannot be used.
-        """
+        """Return the cameras on a device."""
         target = usable_device(device)
         return replace(self, viewmats=self.viewmats.to(target), Ks=self.Ks.to(target))
 
     def resized(self, width: int, height: int) -> Self:
-        """Return cameras with the same field of view and another image size.
-
-        Args:
-            width: Image width, pixels.
-            height: Image height, pixels.
-
-        Returns:
-            Cameras with scaled intrinsics.
-
-        Raises:
-            InvalidArgumentError: A length is no whole number above 0.
-        """
+        """Return cameras with the same field of view and another image size, pixels."""
         width = checked_whole(width, "width")
         height = checked_whole(height, "height")
         factors = self.Ks.new_tensor([width / self.width, height / self.height, 1.0])
@@ -171,12 +140,6 @@ class Cameras:
         Args:
             side: Longer side of the images, pixels.
             least: Smallest length of either side, pixels.
-
-        Returns:
-            Cameras with scaled intrinsics.
-
-        Raises:
-            InvalidArgumentError: A length is no whole number above 0.
         """
         side = checked_whole(side, "side")
         least = checked_whole(least, "least")
@@ -194,12 +157,6 @@ class Cameras:
         Args:
             stride: Step between pixels, along rows and columns.
             first: Column and row of the first pixel, each below the stride and in the image.
-
-        Returns:
-            Cameras of smaller images.
-
-        Raises:
-            InvalidArgumentError: The stride is no whole number above 0, or ``first`` does not fit.
         """
         stride = checked_whole(stride, "stride")
         starts = tuple(map(whole_number, first)) if isinstance(first, Sequence) else ()
@@ -214,17 +171,7 @@ class Cameras:
         return self._strided(stride, self.Ks.new_tensor([starts]), width=width, height=height)
 
     def interleaved(self, stride: int) -> Self:
-        """Return cameras that see only every ``stride``-th pixel, with offsets that differ.
-
-        Args:
-            stride: Step between pixels, along rows and columns; 1 changes nothing.
-
-        Returns:
-            Cameras of smaller images, all of one size; see :meth:`every`.
-
-        Raises:
-            InvalidArgumentError: The stride is no whole number above 0.
-        """
+        """Return cameras like those of :meth:`every`, with first pixels that differ."""
         stride = checked_whole(stride, "stride")
         if stride == 1:
             return self
@@ -252,12 +199,6 @@ class Cameras:
 
         Args:
             factor: Ratio of the two sizes; 1 changes nothing.
-
-        Returns:
-            The same cameras otherwise.
-
-        Raises:
-            InvalidArgumentError: The factor is no whole number above 0.
         """
         factor = checked_whole(factor, "factor")
         if factor == 1:
@@ -272,10 +213,7 @@ class Cameras:
         """Return cameras of which about every third one ignores the tag ``SplatRenderMode: mip``.
 
         Multiples of an irrational number decide, so that every eighth or ninth camera, as is held
-        out elsewhere, is not always of the same kind.
-
-        Returns:
-            The same cameras otherwise; unchanged if ``ignores_tag`` is given.
+        out elsewhere, is not always of the same kind. A given ``ignores_tag`` stays.
         """
         if self.ignores_tag:
             return self
@@ -285,17 +223,7 @@ class Cameras:
     @without_autocast()
     @checked
     def shows_any(self, points: Float[Tensor, "n 3"]) -> bool:
-        """Check whether any point lies within any of the images.
-
-        Args:
-            points: Positions in the units of the cameras.
-
-        Returns:
-            Whether one is at least 0.01 before a camera (the near plane) and within its image.
-
-        Raises:
-            InvalidArgumentError: ``points`` is no tensor of floats of this shape.
-        """
+        """Return whether any point is within an image, and at least 0.01 before its camera."""
         scales = view_scales(self.viewmats).to(points)[:, None, None]
         for view, matrix in zip(self.viewmats.to(points) / scales, self.Ks.to(points), strict=True):
             x, y, depth = matrix @ (view[:3, :3] @ points.T + view[:3, 3:])
@@ -305,17 +233,7 @@ class Cameras:
         return False
 
     def spread(self, count: int) -> Self:
-        """Return some of the cameras, evenly spaced in their order.
-
-        Args:
-            count: Number of cameras, at least 1; all are returned if there are no more.
-
-        Returns:
-            The selected cameras.
-
-        Raises:
-            InvalidArgumentError: The count is no whole number above 0.
-        """
+        """Return some of the cameras, evenly spaced in their order; all if there are no more."""
         return self.select(spread_rows(len(self), checked_whole(count, "count")))
 
 
@@ -356,19 +274,14 @@ def look_at(
     targets: Float[Tensor, "c 3"] | Float[Tensor, "1 3"],
     up: Float[Tensor, "3"] | Int[Tensor, "3"],
 ) -> Float[Tensor, "c 4 4"]:
-    """Build view matrices of cameras that look at points.
+    """Return world-to-camera matrices, with OpenCV axes, of cameras that look at points.
+
+    A camera that looks along ``up`` gets another up.
 
     Args:
         eyes: Positions of the cameras.
         targets: Point in the middle of each image, or one for all; none may be at its camera.
         up: Direction that is up in the images, of any length but 0.
-
-    Returns:
-        World-to-camera matrices with OpenCV axes; a camera that looks along ``up`` gets another up.
-
-    Raises:
-        InvalidArgumentError: A target is at the position of its camera, ``up`` is 0, a number is
-            not finite, or shapes or types do not fit.
 
     Example:
         >>> up = torch.tensor([0.0, -1.0, 0.0])

@@ -28,12 +28,13 @@ _NOT_INDEXABLE = (torch.uint16, torch.uint32, torch.uint64)  # torch cannot sele
 _TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
 
-def _is_text(value: object) -> bool:
-    return isinstance(value, str)
+def _are_texts(values: object) -> bool:
+    return isinstance(values, tuple | list) and all(isinstance(value, str) for value in values)
 
 
-def _is_pair_of_texts(value: object) -> bool:
-    return isinstance(value, tuple | list) and len(value) == 2 and all(map(_is_text, value))
+def _are_pairs(values: object) -> bool:
+    is_list = isinstance(values, tuple | list)
+    return is_list and all(_are_texts(value) and len(value) == 2 for value in values)
 
 
 def _rebuilt(kind: type["GaussianScene"], values: dict[str, Any]) -> "GaussianScene":
@@ -117,13 +118,12 @@ class GaussianScene:
                 f"shN must hold 0, 3, 8 or 15 coefficients per channel, found {bands}."
             )
         names = tuple(self.extras) if isinstance(self.extras, Mapping) else self.extras
-        for what, lines, entries, fits in (
-            ("comments", self.comments, "texts", _is_text),
-            ("names of extra columns", names, "texts", _is_text),
-            ("layout", self.layout, "pairs of texts", _is_pair_of_texts),
+        for wanted, lines, fits in (
+            ("comments must be a tuple of texts", self.comments, _are_texts),
+            ("names of extra columns must be a tuple of texts", names, _are_texts),
+            ("layout must be a tuple of pairs of texts", self.layout, _are_pairs),
         ):
-            if not isinstance(lines, tuple | list) or not all(map(fits, lines)):
-                wanted = f"{what} must be a tuple of {entries}"
+            if not fits(lines):
                 raise InvalidSceneError(f"{wanted}, found {shown(lines)}.")
         for name, column in self.extras.items():
             found = getattr(column, "dtype", type(column).__name__)
@@ -198,11 +198,7 @@ class GaussianScene:
         return self.means.dtype
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the six standard tensors by name.
-
-        Returns:
-            A new dictionary: means, quats, log_scales, logit_opacities, sh0, shN.
-        """
+        """Return the six standard tensors by name: means, quats and so on, in this order."""
         return {name: getattr(self, name) for name in _TENSORS}
 
     def select(self, rows: Rows) -> Self:
@@ -217,8 +213,7 @@ class GaussianScene:
             A scene with a copy of those rows.
 
         Raises:
-            InvalidArgumentError: A mask has not one entry per Gaussian, a number is out of range
-                (which is checked on a CPU only), or ``rows`` is a single number or uint8.
+            InvalidArgumentError: The rows do not fit; numbers are checked on a CPU only.
         """
         chosen = row_numbers(rows, len(self), things="Gaussians", device=self.device)
         return self.with_tensors(
@@ -237,31 +232,13 @@ class GaussianScene:
         axes: str | None = None,
         spz_version: Literal[2, 3, 4] = 3,
     ) -> None:
-        """Write the scene to a file, as :func:`cvtgs.save` does.
-
-        Args:
-            path: Path of the file, whose suffix chooses the format, or an open binary file.
-            format: Suffix of the format, if the file name does not have it.
-            overwrite: Whether an existing file may be replaced.
-            axes: Directions of x, y and z in the file; None for the axes of the format.
-            spz_version: Version of the format in a ``.spz``: 2, 3 or 4, as for :func:`cvtgs.save`.
-        """
+        """Write the scene to a file; arguments and errors as for :func:`cvtgs.save`."""
         resolve_name("cvtgs.io.formats:save")(
             self, path, format=format, overwrite=overwrite, axes=axes, spz_version=spz_version
         )
 
     def with_sh_degree(self, degree: int) -> Self:
-        """Drop the SH bands above a degree, which makes files of the scene smaller.
-
-        Args:
-            degree: 0 to 3.
-
-        Returns:
-            The same Gaussians with fewer bands; the same object if there are none above the degree.
-
-        Raises:
-            InvalidArgumentError: The degree is not from 0 to 3.
-        """
+        """Drop the SH bands above a degree, 0 to 3; return the same object if there are none."""
         if whole_number(degree) not in range(len(spherical_harmonics.REST_COUNTS)):
             raise InvalidArgumentError(f"the SH degree must be from 0 to 3, found {degree!r}.")
         if degree >= self.sh_degree:
@@ -282,12 +259,6 @@ class GaussianScene:
             tensors: Some or all of the six standard tensors by name.
             extras: All extra columns; None for those of this scene.
             named: Standard tensors by keyword: ``scene.with_tensors(sh0=colors)``.
-
-        Returns:
-            The new scene.
-
-        Raises:
-            InvalidSceneError: A tensor name is unknown, or tensors do not fit together.
         """
         if not isinstance(tensors, Mapping | None):
             raise InvalidSceneError(f"tensors must be a mapping by name, found {shown(tensors)}.")
@@ -302,17 +273,7 @@ class GaussianScene:
         return replace(self, **changes)
 
     def to(self, device: torch.device | str) -> Self:
-        """Move the scene to a device.
-
-        Args:
-            device: The target device.
-
-        Returns:
-            The same object if it is already there, else a copy.
-
-        Raises:
-            DeviceError: The device cannot be used.
-        """
+        """Return the scene on a device: the same object if it is already there, else a copy."""
         target = usable_device(device)
         if target == self.device:
             return self
