@@ -68,19 +68,7 @@ class Motion:
     def of_angles(
         cls, angles: Corner, *, scale: float = 1.0, shift: Corner = _NO_SHIFT
     ) -> "Motion":
-        """Build a motion from angles.
-
-        Args:
-            angles: Degrees about x, then y, then z; the axes are fixed (extrinsic rotations).
-            scale: Factor of all lengths.
-            shift: Translation.
-
-        Returns:
-            The motion.
-
-        Raises:
-            InvalidArgumentError: A number is not finite, or the factor is not above 0.
-        """
+        """Build a motion from degrees about x, then y, then z; the axes are fixed (extrinsic)."""
         degrees = finite_numbers(angles, 3)
         if degrees is None:
             raise InvalidArgumentError(
@@ -105,18 +93,14 @@ def _cos_sin(degrees: float) -> tuple[float, float]:
 
 @checked
 def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -> GaussianScene:
-    """Keep the Gaussians whose centres lie in a region; centres with NaN lie in none.
+    """Keep the Gaussians whose centres lie in any region; centres with NaN lie in none.
 
     Args:
         scene: The scene; it is not changed.
-        regions: A box or sphere, or several; Gaussians in any of them are kept.
+        regions: A box or sphere, or several.
 
     Returns:
         The kept Gaussians, in their order, bit for bit; the same object if all are kept.
-
-    Raises:
-        InvalidArgumentError: There is no region, one is neither a box nor a sphere, or ``scene`` is
-            no scene.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -140,9 +124,6 @@ def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
 
     Returns:
         The others, in their order, bit for bit; the same object if none is dropped.
-
-    Raises:
-        InvalidArgumentError: The opacity is not from 0 to 1, or ``scene`` is no scene.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -168,9 +149,6 @@ def drop_large(scene: GaussianScene, largest: float) -> GaussianScene:
 
     Returns:
         The others, in their order, bit for bit; the same object if none is dropped.
-
-    Raises:
-        InvalidArgumentError: The size is not above 0, or ``scene`` is no scene.
 
     Example:
         >>> from cvtgs.synthetic import scene as make

@@ -41,8 +41,7 @@ class LevelEntry(Record):
         ssim: Mean SSIM, likewise.
         lpips: Mean LPIPS, likewise.
         alpha_error: Mean absolute difference of accumulated alpha, likewise.
-        alpha_bias: Mean signed difference of accumulated alpha, likewise; negative if more of the
-            background shows through.
+        alpha_bias: Mean signed difference, negative if more of the background shows through.
     """
 
     file: str
@@ -60,14 +59,7 @@ class LevelEntry(Record):
     alpha_bias: float | None = None
 
     def with_scores(self, scores: SceneScores) -> Self:
-        """Return the entry with scores.
-
-        Args:
-            scores: Scores of the file.
-
-        Returns:
-            A new entry.
-        """
+        """Return the entry with the scores of its file."""
         return self.model_copy(update=scores.means())
 
 

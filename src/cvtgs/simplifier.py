@@ -100,8 +100,9 @@ class Simplifier:
             InvalidSceneError: The scene has no valid row.
             InputError, FileFormatError: A path cannot be read, as for :func:`cvtgs.load`.
         """
-        prepared = self.prepare(scene, cameras=cameras)
-        return prepared.run(rho, count=count, max_count=max_count, keep=keep).scene
+        return self.run(
+            scene, rho, count=count, max_count=max_count, cameras=cameras, keep=keep
+        ).scene
 
     def run(
         self,
@@ -113,11 +114,7 @@ class Simplifier:
         cameras: Cameras | None = None,
         keep: MaskLike | None = None,
     ) -> Simplified:
-        """Simplify a scene, and report; arguments and errors as for :meth:`simplify`.
-
-        Returns:
-            The scene and the report.
-        """
+        """Simplify a scene, and report; arguments and errors as for :meth:`simplify`."""
         return self.prepare(scene, cameras=cameras).run(
             rho, count=count, max_count=max_count, keep=keep
         )
@@ -136,7 +133,7 @@ class Simplifier:
             cameras: Cameras for presets that render the scene; None finds or generates views.
 
         Returns:
-            One level per ratio, in the order of the ratios, of exactly ``ceil(rho * N)`` Gaussians.
+            One level per ratio, in the order of the ratios.
 
         Raises:
             InvalidArgumentError: A ratio is out of range, or there is none.
@@ -160,12 +157,6 @@ class Simplifier:
                 use, or the path of its file or folder.
             cameras: Cameras for presets that render the scene; None takes those beside the file or
                 in the folder (:func:`cvtgs.views.find_own_cameras`), or else generates views.
-
-        Returns:
-            The prepared scene.
-
-        Raises:
-            InvalidArgumentError: It is neither a scene nor a path, or ``cameras`` are none.
 
         Example:
             >>> from cvtgs.synthetic import scene as make

@@ -18,8 +18,6 @@ from cvtgs.errors import InvalidArgumentError, MissingDependencyError, how_to_in
 if TYPE_CHECKING:
     import viser
 
-__all__ = ["check_viewer", "start_server", "stop_server"]
-
 _STARTING = Lock()  # held while the server of websockets is replaced
 
 _MOST_PORTS, _LAST_PORT = 1000, 65535  # number of ports to try, as viser does
@@ -28,11 +26,7 @@ _OWN_NAMES = {"localhost", "127.0.0.1", "::1"}
 
 
 def check_viewer() -> None:
-    """Check that pages can be served, before scenes are read.
-
-    Raises:
-        MissingDependencyError: viser is not installed.
-    """
+    """Raise MissingDependencyError if viser is not installed, before scenes are read."""
     try:
         import viser  # noqa: F401, PLC0415 (optional)
     except ImportError as error:
@@ -90,11 +84,9 @@ def _open_address(host: str, port: int) -> tuple[str, int]:
 
 @contextmanager
 def _refusing_other_sites(names: set[str]) -> Iterator[None]:
-    """Make servers that start meanwhile refuse pages that have none of these host names.
-
-    A browser lets any page connect to this machine, and a page's name may resolve to it. viser
-    checks neither, and takes no such check, so it gets it from the library that it serves with.
-    """
+    """Make servers that start meanwhile refuse pages that have none of these host names."""
+    # A browser lets any page connect to this machine, and a page's name may resolve to it. viser
+    # checks neither, and takes no such check, so it gets it from the library that it serves with.
     library: Any = import_module("websockets.asyncio.server")
     serve = library.serve
 
@@ -120,10 +112,7 @@ def _refusing_other_sites(names: set[str]) -> Iterator[None]:
 
 
 def is_own(headers: Mapping[str, str], names: set[str]) -> bool:
-    """Return whether a request is for one of these host names, and from a page with one, if any.
-
-    Programs other than browsers name no page.
-    """
+    """Return whether a request is for one of these host names; a browser's page must have one."""
     try:
         hosts = [urlsplit(f"//{headers['Host']}").hostname]
         if "Origin" in headers:

@@ -28,8 +28,6 @@ from cvtgs.views.layout import find_layout
 if TYPE_CHECKING:
     import viser
 
-__all__ = ["ViewerServer", "scene_page"]
-
 Point = tuple[float, float, float]
 
 _FLIP_SECONDS = 2.0  # seconds for which a standalone page shows each scene
@@ -70,15 +68,9 @@ _GIVE_UP = 0.5  # seconds between checks whether the server was closed
 
 
 def scene_page(scenes: Mapping[str, GaussianScene]) -> str:
-    """Return a standalone page with a 3D viewer, whose time line flips between scenes.
+    """Return a standalone page, HTML that fetches nothing, whose time line flips between scenes.
 
-    Colours are those of the constant SH band.
-
-    Args:
-        scenes: The scenes by name; the camera starts at a good view of the first.
-
-    Returns:
-        HTML that needs no server and fetches nothing.
+    Colours are those of the constant SH band; the camera starts at a good view of the first scene.
 
     Raises:
         MissingDependencyError: viser is not installed.
@@ -227,11 +219,7 @@ class ViewerServer:
         threading.Thread(target=self._work, daemon=True).start()
 
     def page(self) -> str:
-        """Return a standalone page with the current scenes; its time line flips between them.
-
-        Returns:
-            HTML that needs no server and fetches nothing.
-        """
+        """Return a standalone page of the current scenes, as :func:`scene_page` does."""
         names = [name for name in (FULL, SIMPLIFIED, *self._nodes) if name in self._nodes]
         html = record_page(self._server, [self._nodes[name] for name in dict.fromkeys(names)])
         self._show()
@@ -250,11 +238,7 @@ class ViewerServer:
             pass
 
     def finish(self) -> None:
-        """Wait until the first simplified scene is shown.
-
-        Raises:
-            CvtgsError: It cannot be computed.
-        """
+        """Wait until the first simplified scene is shown; raise if it cannot be computed."""
         self._first.wait()
         if self._error is not None:
             raise self._error
