@@ -54,16 +54,11 @@ from cvtgs.streams.tiles import TilesFormat, check_no_environment, check_transfo
 from cvtgs.text import counted, shown
 from cvtgs.validity import warn_of_dropped, with_finite_opacities
 
-__all__ = ["StreamReport", "stream_file"]
-
 
 class StreamReport(NamedTuple):
-    """Report of a written stream.
+    """Counts of a written stream: of each level, the finest first, and of chunks and blocks.
 
     Attributes:
-        levels: Counts and bytes of each level, the finest first.
-        chunks: Number of chunks.
-        blocks: Number of blocks.
         resumed_blocks: Number of blocks that an earlier run had finished.
     """
 
@@ -156,11 +151,9 @@ def stream_file(  # noqa: PLR0913 (options by name)
 ) -> StreamReport:
     """Write a file that need not fit into memory as a stream of levels.
 
-    The file is sorted into blocks of space, which are stored in a hidden folder beside the output.
-    Each block is simplified to its exact share of every level, based on the analysis of the whole
-    scene, and written as a part of the stream. Shares follow the cells of a sample of the whole
-    scene. After an interruption, the same call continues with the unfinished blocks. The result
-    depends on the number of blocks, not on the workers.
+    The file is sorted into blocks of space, as by :func:`cvtgs.outofcore.simplify_file`. Each is
+    simplified to its exact share of every level, which follows the cells of a sample of the scene,
+    and written as a part of the stream. After an interruption, the same call continues.
 
     Args:
         source: A binary PLY file.
@@ -182,14 +175,10 @@ def stream_file(  # noqa: PLR0913 (options by name)
         overwrite: Whether files of an earlier stream may be replaced.
         listener: Called with progress events.
 
-    Returns:
-        The report.
-
     Raises:
         ConfigError: The configuration renders images, which needs the whole scene in memory.
-        InvalidArgumentError: A ratio is out of range, two ratios give the same size, chunks would
-            be empty, the kind does not have an option, or an argument is out of range or of another
-            type.
+        InvalidArgumentError: Two ratios give the same size, the kind does not have an option, or
+            an argument is out of range or of another type.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
         OutputExistsError: The folder holds files that may not be replaced.
@@ -291,7 +280,7 @@ def _format(
             f"{SCENE_AXES}, found {axes[1]!r}."
         )
     check_no_environment(environment_radii is not None)
-    return TilesFormat(transform=None if transform is None else check_transform(transform))
+    return TilesFormat(transform=check_transform(transform))
 
 
 def _run(

@@ -31,11 +31,8 @@ from cvtgs.io.locks import hidden_path
 from cvtgs.progress import ProgressListener
 from cvtgs.streams.plan import StreamPlan, join_boxes
 
-__all__ = ["INDEX_NAMES", "StreamLevel", "check_stream"]
-
 INDEX_NAMES = {"sog": "lod-meta.json", "3dtiles": "tileset.json"}
 """The file that a viewer opens, by the kind of the stream."""
-
 
 _OWN = r"\d+_\d+\.glb|\d+_\d+_\d+|environment"
 """Matches the names of files and folders that cvtgs itself can have written."""
@@ -45,13 +42,7 @@ _OWN_NAME = re.compile(r'"(\d+_\d+\.glb|\d+_\d+_\d+(?=/meta\.json")|environment(
 
 
 class StreamLevel(NamedTuple):
-    """Counts of a written level.
-
-    Attributes:
-        gaussians: Number of Gaussians.
-        files: Number of files, or of folders of files.
-        bytes: Total bytes of the files.
-    """
+    """Numbers of Gaussians, of files (or of folders of them) and of bytes of a written level."""
 
     gaussians: int
     files: int
@@ -88,10 +79,7 @@ class StreamFormat(Protocol):
         ...
 
     def index(self, parts: Sequence[StreamPart], folder: Path) -> dict[str, Any]:
-        """Return the content of the index, and write files that all parts share to their folder.
-
-        Consecutive parts must be close in space.
-        """
+        """Return the index of parts in spatial order; write the files that they share."""
         ...
 
 
@@ -150,10 +138,9 @@ def join_trees(
     leaves: Sequence[dict[str, Any]],
     inner: Callable[[Corner, Corner, list[dict[str, Any]]], dict[str, Any]],
 ) -> dict[str, Any]:
-    """Build the tree above parts and return its root; a node has half of the parts of its parent.
+    """Return the root of a tree above parts, whose nodes are ``leaves``; each node has two halves.
 
-    ``leaves`` are the nodes of the parts; ``inner`` returns an inner node from the corners of its
-    box and its children.
+    ``inner`` returns an inner node from the corners of its box and its children.
     """
     if len(parts) == 1:
         return leaves[0]
@@ -184,12 +171,9 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
 
 
 def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
-    """Move the files of a finished stream to the output folder, the index last.
+    """Move the files of a finished stream, but hidden ones, to the output folder, the index last.
 
-    Files of the stream that it replaces are set aside, its index first, so that no index ever names
-    files of another stream. They are moved back if this fails or is interrupted. A folder that
-    exists is kept, since it has permissions and may be the current one of a shell. Hidden files are
-    not published: only resumed runs need them.
+    Replaced files are set aside, the index first, which thus never names files of another stream.
     """
     check_stream(place, kind, overwrite=overwrite)
     index, target = INDEX_NAMES[kind], Path(os.path.realpath(place))
@@ -201,6 +185,7 @@ def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
             return
     except OSError as error:
         raise _refused(place, error) from error
+    # A folder that exists is kept: it has permissions, and may be the current one of a shell.
     found = {path.name for path in hidden.iterdir()}
     names = sorted(name for name in found if name != index and not name.startswith("."))
     old = [index, *sorted({*names, *_names_of(place / index)})]

@@ -26,8 +26,6 @@ from cvtgs.scene import GaussianScene
 from cvtgs.streams.files import StreamLevel, StreamPart, join_levels, join_trees, write_stream
 from cvtgs.streams.plan import StreamNode, StreamPlan, environment_level
 
-__all__ = ["write_sog_stream"]
-
 FILE_GAUSSIANS = 1 << 18  # maximum number of Gaussians in a file, unless a single chunk has more
 
 ENVIRONMENT = "environment"  # name of its folder
@@ -132,7 +130,6 @@ def write_sog_stream(
         The written counts of each level, the finest first.
 
     Raises:
-        InvalidArgumentError: An argument has another type, or files would be empty.
         OutputExistsError: The folder holds files that may not be replaced.
         OutputError: A file cannot be written.
         InvalidSceneError: A Gaussian is not finite.
@@ -148,8 +145,7 @@ def write_sog_stream(
         ...     [len(cvtgs.load(folder, lod=lod)) for lod in (0, 1)]
         [250, 25]
     """
-    file_gaussians = checked_whole(file_gaussians, "file_gaussians")
-    form = SogFormat(file_gaussians=file_gaussians)
+    form = SogFormat(file_gaussians=checked_whole(file_gaussians, "file_gaussians"))
     return write_stream(form, plan, folder, overwrite=overwrite, listener=listener)
 
 

@@ -4,7 +4,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,6 @@ from cvtgs.streams.files import StreamLevel, StreamPart, join_trees, write_strea
 from cvtgs.streams.plan import StreamNode, StreamPlan, box_of, join_boxes
 from cvtgs.text import shown
 
-__all__ = ["check_transform", "geo_transform", "write_tiles"]
-
 TILE_GAUSSIANS = 1 << 16
 """Maximum number of Gaussians in a tile, unless it holds the coarsest level or a single chunk."""
 
@@ -52,7 +50,7 @@ class _Tile:
 
     level: int
     chunks: range
-    children: list["_Tile"] = field(default_factory=list)
+    children: list["_Tile"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +58,7 @@ class TilesFormat:
     """3D Tiles 1.1, as CesiumJS loads them."""
 
     tile_gaussians: int = TILE_GAUSSIANS  # the most in a tile; a chunk is never split
-    transform: tuple[float, ...] | None = None  # from z up and metres, column by column
+    transform: tuple[float, ...] = _UNMOVED  # from z up and metres, column by column
     kind: str = "3dtiles"
 
     def write_part(
@@ -108,7 +106,7 @@ class TilesFormat:
         """Return the content of ``tileset.json``; tiles share no other file."""
         low, high = join_boxes((part.box_min, part.box_max) for part in parts)
         root = join_trees(parts, [part.tree for part in parts], _parent)
-        to_place = _matrix(_UNMOVED if self.transform is None else self.transform)
+        to_place = _matrix(self.transform)
         scale = float(to_place[:3, :3].norm(dim=0).max())  # of the root's own error, for viewers
         extensions = {"extensionsUsed": [SPLATS, SPZ], "extensionsRequired": [SPLATS, SPZ]}
         return {
@@ -171,11 +169,10 @@ def write_tiles(
         ...     len(cvtgs.load(f"{folder}/0_0.glb")), written[0].gaussians
         (25, 250)
     """
-    tile_gaussians = checked_whole(tile_gaussians, "tile_gaussians")
     check_no_environment(bool(plan.far))
     form = TilesFormat(
-        tile_gaussians=tile_gaussians,
-        transform=None if transform is None else check_transform(transform),
+        tile_gaussians=checked_whole(tile_gaussians, "tile_gaussians"),
+        transform=check_transform(transform),
     )
     return write_stream(form, plan, folder, overwrite=overwrite, listener=listener)
 
@@ -232,8 +229,10 @@ def check_no_environment(has_one: bool) -> None:
         )
 
 
-def check_transform(numbers: Sequence[float]) -> tuple[float, ...]:
+def check_transform(numbers: Sequence[float] | None) -> tuple[float, ...]:
     """Return the transform of a tileset, 16 numbers by columns; raise unless it is invertible."""
+    if numbers is None:
+        return _UNMOVED
     values = tuple(map(real_number, numbers)) if isinstance(numbers, Iterable) else ()
     is_matrix = len(values) == 16 and all(map(math.isfinite, values))
     last = values[3::4]
@@ -332,10 +331,8 @@ def _parent(low: Corner, high: Corner, children: list[dict[str, Any]]) -> dict[s
 
 
 def _located(low: Corner, high: Corner, origin: Corner) -> dict[str, Any]:
-    """Return the box of a tile, and the translation to its origin, both in the axes of 3D Tiles.
-
-    In them, x is left, y back and z up in the scene.
-    """
+    """Return the box of a tile, and the translation to its origin, in the axes of 3D Tiles."""
+    # In them, x is left, y back and z up in the scene.
     start, *corners = ((-x, -z, -y) for x, y, z in (origin, low, high))
     middle = [(a + b) / 2 - o for o, a, b in zip(start, *corners, strict=True)]
     half = [abs(a - b) / 2 for a, b in zip(*corners, strict=True)]
@@ -344,10 +341,7 @@ def _located(low: Corner, high: Corner, origin: Corner) -> dict[str, Any]:
 
 
 def _relative(tile: dict[str, Any], above: Float[Tensor, "4 4"]) -> dict[str, Any]:
-    """Return a tile whose transforms, and those below, go to the axes of its parent.
-
-    ``above`` is the transform to these axes.
-    """
+    """Return a tile whose transforms, and those below, go to the axes that ``above`` leads to."""
     own = _matrix(tile["transform"])
     inverse = 2 * _matrix(_UNMOVED) - own  # of a translation
     moved = {**tile, "transform": (above @ own).T.flatten().tolist()}
