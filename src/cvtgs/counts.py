@@ -167,10 +167,7 @@ def whole_number(number: object) -> int:
 def checked_whole(
     value: object, name: str, *, least: int = 1, most: int | None = None, things: str = ""
 ) -> int:
-    """Return a whole number of any type; raise unless it is at least 1 or 0, and at most a limit.
-
-    ``things`` says what the limit counts.
-    """
+    """Return a whole number; raise unless it is from 1 or 0 to a limit, the count of ``things``."""
     number = whole_number(value)
     if number < least or (most is not None and number > most):
         limits = "above 0" if least else "at least 0"
@@ -192,9 +189,9 @@ def spread_rows(length: int, count: int) -> tuple[int, ...]:
 
 
 def shared_out(total: int, shares: Sequence[float], *, rooms: Sequence[int]) -> list[int]:
-    """Split a count in proportion to shares by largest remainder, with an upper limit for each.
+    """Split a count in proportion to shares, at most a limit each, and at least 1 if that is not 0.
 
-    Where the limit is above 0, at least 1 is given. Of equal remainders the first wins.
+    The largest remainders, of equal ones the first, are rounded up.
     """
     least = [min(1, room) for room in rooms]
     if not sum(least) <= total <= sum(rooms):

@@ -16,12 +16,7 @@ from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shortfall, target_count
-from cvtgs.devices import (
-    chosen_device,
-    threads_for_chunks,
-    within_memory,
-    without_autocast,
-)
+from cvtgs.devices import chosen_device, threads_for_chunks, within_memory, without_autocast
 from cvtgs.edit import concatenate
 from cvtgs.errors import BLOCKS_ADVICE, InvalidArgumentError, memory_errors
 from cvtgs.grouping import OrderedRows, add_neighbors, importance_by_errors, order_rows
@@ -114,22 +109,14 @@ class Prepared:
         max_count: int | None = None,
         keep: MaskLike | None = None,
     ) -> Simplified:
-        """Simplify the scene, and report; arguments and errors as for ``Simplifier.run``.
-
-        Returns:
-            The scene and the report.
-        """
+        """Simplify the scene, and report; arguments and errors as for ``Simplifier.run``."""
         total = len(self._scene)
         target = target_count(total, rho, count=count, max_count=max_count)
         mask = None if keep is None else checked_mask(keep, total)
         return self._attempt(partial(self._run, target, mask))
 
     def _attempt(self, compute: Callable[[], Result]) -> Result:
-        """Compute on the device, or elsewhere if it lacks memory.
-
-        Gradients, inference mode and autocast are off, whatever the program has set: results do not
-        depend on inputs in a differentiable way, and a refinement needs gradients of its own.
-        """
+        """Compute on the device, or elsewhere if it lacks memory, without gradients of inputs."""
 
         def compute_on(device: torch.device, note: str) -> Result:
             if note:  # after a failed attempt
@@ -142,7 +129,7 @@ class Prepared:
         work = f"simplifying {len(self._scene):,} Gaussians"
         with (
             threads_for_chunks(),
-            torch.inference_mode(mode=False),
+            torch.inference_mode(mode=False),  # a refinement needs gradients of its own
             torch.no_grad(),
             without_autocast(),
             memory_errors(work, BLOCKS_ADVICE),
@@ -173,25 +160,19 @@ class Prepared:
         return self._result(reduced, checked, analysis, target, clock, kept_count=len(protected))
 
     def warm_up(self, rho: float) -> None:
-        """Compute and cache in advance the results that the second run would cache.
+        """Cache in advance what the second run would cache, up to the largest ratio to expect."""
+        target = target_count(len(self._scene), rho)
 
-        Args:
-            rho: The largest ratio to expect.
-        """
-        self._attempt(partial(self._warm_up, target_count(len(self._scene), rho)))
+        def compute() -> None:
+            clock = StageClock(silent, self._device)
+            checked, analysis = self._analyze(target, clock)
+            self._has_run = True
+            self._order(checked.scene, analysis, target, clock)
 
-    def _warm_up(self, target: int) -> None:
-        clock = StageClock(silent, self._device)
-        checked, analysis = self._analyze(target, clock)
-        self._has_run = True
-        self._order(checked.scene, analysis, target, clock)
+        self._attempt(compute)
 
     def levels(self, rhos: Sequence[float]) -> tuple[Level, ...]:
-        """Simplify the scene to several levels; see ``Simplifier.levels``.
-
-        Returns:
-            One level per ratio, in the order of the ratios.
-        """
+        """Simplify the scene to several levels; see ``Simplifier.levels``."""
         try:
             ratios = list(rhos)
         except TypeError:  # also a tensor of one number
@@ -263,8 +244,7 @@ class Prepared:
     ) -> Reduced:
         """Run the stages after the analysis, with what earlier runs have cached of whole scenes.
 
-        With given cameras they run twice, the second time with fewer merges where the first result
-        errs. Errors in generated views are not always where people look.
+        With given cameras, but not generated ones, they run again: with fewer merges where it errs.
         """
         if kept is None:
             self._order(valid, analysis, target, clock)

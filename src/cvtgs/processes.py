@@ -33,12 +33,9 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 WAKE_SECONDS = 0.5  # longest wait for a result at once: on Windows, Ctrl-C does not end a wait
+# Larger results, bytes, are in temporary files. A pipe takes that much in one piece, so a process
+# that ends never leaves a part of a result in it, for whose rest the pool would wait forever.
 MOST_SENT = 256
-"""Largest result that is sent through the pipe of the pool, bytes; others are in temporary files.
-
-A pipe takes that much in one piece, so a process that ends never leaves a part of a result in it,
-for whose rest the pool would wait forever.
-"""
 
 SAFE_PATH = "PYTHONSAFEPATH"
 """Variable with which Python imports nothing from the current folder, where any file may lie."""
@@ -53,15 +50,7 @@ class Workers(Protocol):
     def __call__(
         self, function: Callable[[Item], Result], items: Sequence[Item], /
     ) -> Iterable[Result]:
-        """Call the function for every item.
-
-        Args:
-            function: A function that can be pickled.
-            items: The arguments; the calls are independent.
-
-        Returns:
-            The results, in the order of the items.
-        """
+        """Return the results of a function, which can be pickled, in the order of the items."""
         ...
 
 
@@ -169,14 +158,7 @@ class LocalWorkers:
     def __call__(
         self, function: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterator[Result]:
-        """Call a function for every item.
-
-        Args:
-            function: A function that can be pickled.
-            items: The arguments.
-
-        Yields:
-            The results, in the order of the items.
+        """Call a function for every item, as :class:`Workers` do.
 
         Raises:
             InvalidArgumentError: The workers were not started by ``with``.
@@ -229,10 +211,8 @@ class LocalWorkers:
 
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Start processes that Ctrl-C does not reach, until :func:`_begin` ignores it.
-
-    The pool must have been made before: Python ends the hold when it starts a process of its own.
-    """
+    """Start processes that Ctrl-C does not reach, until :func:`_begin` ignores it."""
+    # The pool must have been made before: Python ends the hold when it starts a process of its own.
     if sys.platform == "win32":
         yield
         return

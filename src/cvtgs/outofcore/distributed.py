@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -37,13 +38,10 @@ _SHARE_SECONDS = 10.0  # seconds that a shared disk may take to show a new file 
 
 
 def connect(address: str) -> "Client":
-    """Connect to a scheduler.
+    """Connect to a scheduler; the caller must close the client.
 
     Args:
         address: Its address, such as ``tcp://10.0.0.1:8786``.
-
-    Returns:
-        A client, which the caller must close.
 
     Raises:
         MissingDependencyError: ``distributed`` is not installed.
@@ -123,13 +121,7 @@ class ClusterWorkers:
         self._client = client
 
     def check(self, job: Job) -> int:
-        """Check that all workers can do a job; each wait ends within half a minute.
-
-        Args:
-            job: The job; its folder must exist.
-
-        Returns:
-            The number of workers.
+        """Return the number of workers that can do a job, whose folder must exist.
 
         Raises:
             RunError: There is no worker, or one has no cvtgs, another version, or no access to
@@ -197,16 +189,10 @@ class ClusterWorkers:
     def __call__(
         self, function: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterable[Result]:
-        """Call a function for every item, as :class:`Workers` do; each call is a task.
-
-        Raises:
-            RunError: A task fails repeatedly.
-        """
-        call = self._client.submit
+        """Call a function for every item, as :class:`Workers` do; raise if a task fails often."""
         with _scheduler_errors():
-            futures = [
-                call(_call, function, _versions(), item, pure=False, retries=2) for item in items
-            ]
+            submit = partial(self._client.submit, _call, function, _versions())
+            futures = [submit(item, pure=False, retries=2) for item in items]
         try:
             for future in futures:
                 with _scheduler_errors():
