@@ -20,12 +20,7 @@ from cvtgs.counts import finite_numbers
 from cvtgs.errors import InvalidArgumentError, check_path, input_errors
 from cvtgs.text import MOST_LETTERS, counted, shortened, shown
 
-__all__ = [
-    "Box",
-    "Sphere",
-    "inside",
-    "read_boxes",
-]
+__all__ = ["Box", "Sphere", "inside", "read_boxes"]
 
 Corner = tuple[float, float, float]
 
@@ -39,10 +34,6 @@ class Box(pydantic.BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     Attributes:
         min: Least coordinates, scene units.
         max: Largest coordinates, none below those of ``min``.
-
-    Raises:
-        InvalidArgumentError: A corner does not consist of three finite numbers, or ``min`` is above
-            ``max``.
 
     Example:
         >>> Box(min=(0, 0, 0), max=(1, 1, 1)).max
@@ -82,9 +73,6 @@ class Sphere:
         center: Centre, scene units.
         radius: Radius, scene units, at least 0.
 
-    Raises:
-        InvalidArgumentError: A number is not finite, or the radius is negative.
-
     Example:
         >>> Sphere(center=(0.0, 0.0, 0.0), radius=1.0).radius
         1.0
@@ -110,13 +98,9 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
     Args:
         path: A file that holds ``{"min": [x, y, z], "max": [x, y, z]}``, or a list of these.
 
-    Returns:
-        The boxes, at least one.
-
     Raises:
-        InputNotFoundError: There is no such file.
         InputError: The file cannot be read.
-        InvalidArgumentError: The file holds something else, or ``path`` is no path.
+        InvalidArgumentError: The file holds something else.
 
     Example:
         >>> import tempfile
@@ -157,13 +141,6 @@ def inside(
     Args:
         regions: The boxes and spheres, or a single one.
         means: Positions, scene units.
-
-    Returns:
-        The mask.
-
-    Raises:
-        InvalidArgumentError: A region is something else, or positions are no floats of shape
-            ``(n, 3)``.
 
     Example:
         >>> box = Box(min=(0, 0, 0), max=(1, 1, 1))

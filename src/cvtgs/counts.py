@@ -57,8 +57,7 @@ def target_count(
         ``ceil(rho * N)``, or ``count``, or ``min(max_count, N)``.
 
     Raises:
-        InvalidArgumentError: A value is out of range or of another type, or not exactly one of the
-            three is given.
+        InvalidArgumentError: A value is out of range, or not exactly one of the three is given.
 
     Example:
         >>> target_count(250, 0.01), target_count(10, 1e-9)

@@ -33,10 +33,6 @@ class Motion:
         scale: Factor of all lengths, above 0.
         shift: Translation, scene units, applied last.
 
-    Raises:
-        InvalidArgumentError: A number is not finite, the factor is not above 0, or the quaternion
-            is too short or too long.
-
     Example:
         >>> Motion(scale=2.0).shift
         (0.0, 0.0, 0.0)
@@ -181,8 +177,7 @@ def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
         alone, a scale factor the centres and scales alone.
 
     Raises:
-        InvalidArgumentError: Coordinates would leave the range of the dtype or shrink to 0, or an
-            argument has another type.
+        InvalidArgumentError: Coordinates would leave the range of the dtype or shrink to 0.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -236,8 +231,7 @@ def turned_normals(extras: Mapping[str, Tensor], matrix: Tensor) -> dict[str, Te
 def concatenate(scenes: Iterable[GaussianScene], *, fill: bool = False) -> GaussianScene:
     """Return the Gaussians of several scenes as one scene.
 
-    A warning says if only some scenes were trained with anti-aliasing, since viewers cannot show
-    all of them correctly.
+    A warning says if only some were trained with anti-aliasing: viewers cannot show all correctly.
 
     Args:
         scenes: At least one, all on one device. Without ``fill``, they must have the same SH

@@ -18,13 +18,7 @@ from cvtgs.config import MergeConfig, SimplifyConfig
 from cvtgs.cvt.nearest import search_name
 from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
-from cvtgs.grouping import (
-    OrderedRows,
-    allocate,
-    collect_cells,
-    tessellate_rows,
-    weigh_rows,
-)
+from cvtgs.grouping import OrderedRows, allocate, collect_cells, tessellate_rows, weigh_rows
 from cvtgs.math.segments import label_sums, segment_ids
 from cvtgs.mergenet import Net, correct_cells
 from cvtgs.report import CellStatistics, MatchReport, rms_error
@@ -167,16 +161,9 @@ def group_and_merge(  # noqa: PLR0913 (options by name)
 ) -> tuple[Merged, cells.Partition, CellStatistics]:
     """Run the stages before the network: filter, weigh, tessellate, allocate, merge.
 
-    Args:
-        scene: The Gaussians, without bands that the plan drops; more than ``target`` of them.
-        analysis: Their analysis.
-        target: Number of Gaussians to keep.
-        config: The configuration.
-        with_network: Whether a network needs the neighbours.
-        clock: Measures each stage.
-        ordered: As for :func:`reduce_scene`.
-        importance: As for :func:`reduce_scene`.
-        origin: Point that is subtracted from positions before cells merge; None for none.
+    Arguments are as for :func:`reduce_scene`, but the scene has more than ``target`` Gaussians, and
+    no bands that the plan drops; ``with_network`` says whether a network needs the neighbours, and
+    ``origin`` is subtracted from positions before cells merge.
 
     Returns:
         One Gaussian per cell, the rows that make up every cell, and statistics.
@@ -239,9 +226,6 @@ def merge_and_inflate(
         clamping: Whether merged colours make up for members with colours below zero.
         with_network: Whether a network needs the neighbours.
         on_cells: Called with the number of finished cells.
-
-    Returns:
-        One Gaussian per cell.
     """
     merged, represented = merge_members(
         scene, partition, config, areas=areas, clamping=clamping, on_cells=on_cells
@@ -302,7 +286,7 @@ def level_facts(
     *,
     is_valid: Bool[Tensor, "n"] | None = None,
 ) -> tuple[float, Int[Tensor, "n"] | None, Float[Tensor, "2 m"] | None]:
-    """Compute error, assignment and error sums of a level, as in :class:`cvtgs.Level`, on the CPU.
+    """Return error, assignment and error sums of a level, as in :class:`cvtgs.Level`, on the CPU.
 
     ``is_valid`` says which input rows the scene has; None if it has all of them.
     """

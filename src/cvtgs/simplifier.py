@@ -125,7 +125,7 @@ class Simplifier:
         """Simplify a scene to several levels, in less time than separate runs.
 
         Every level equals the result of :meth:`run` at its ratio, bit for bit; what does not depend
-        on the ratio is computed once.
+        on the ratio is computed once. Errors are as for :meth:`simplify`.
 
         Args:
             scene: The scene, which is not changed, or the path of its file or folder.
@@ -134,10 +134,6 @@ class Simplifier:
 
         Returns:
             One level per ratio, in the order of the ratios.
-
-        Raises:
-            InvalidArgumentError: A ratio is out of range, or there is none.
-            InvalidSceneError: The scene has no valid row.
 
         Example:
             >>> from cvtgs.synthetic import scene as make
@@ -205,9 +201,7 @@ def simplify(
     preset: str = "standard",
     device: str | torch.device = "auto",
 ) -> GaussianScene:
-    """Simplify a scene.
-
-    :class:`cvtgs.Simplifier` does the same, with more options and a report.
+    """Simplify a scene, as :meth:`Simplifier.simplify`, which has more options.
 
     Args:
         scene: The scene, or the path of a file or folder that :func:`cvtgs.load` reads.
@@ -222,12 +216,8 @@ def simplify(
         leave fewer.
 
     Raises:
-        InputError: The file is missing (:class:`cvtgs.errors.InputNotFoundError`) or unreadable.
-        FileFormatError: The file violates its format.
         ConfigError: There is no such preset.
-        DeviceError: The device cannot be used.
-        InvalidArgumentError: Ratio or count is out of range, or not exactly one is given.
-        InvalidSceneError: The scene has no valid row.
+        CvtgsError: As for :class:`Simplifier` and its method.
 
     Example:
         >>> from cvtgs.synthetic import scene as make

@@ -163,15 +163,13 @@ def stream_file(  # noqa: PLR0913 (options by name)
         memory: Bytes that one process may use; None for all free memory.
         blocks: Number of blocks, instead of ``memory``.
         chunk_gaussians: Maximum number of Gaussians of the finest level in a chunk.
-        environment_radii: Gaussians farther from the centre than this, in robust radii, are the
-            environment of a streamed SOG, which all levels share; None for no environment.
+        environment_radii: As for :func:`plan_stream`; only a streamed SOG has an environment.
         transform: Root transform of 3D Tiles (:func:`cvtgs.streams.geo_transform`).
         axes: Axes of the input file and of the output; those of 3D Tiles are fixed, so their
             output must be ``rdf``.
-        sh_degree: Highest SH degree to keep; None keeps all.
+        sh_degree: SH bands above this degree are dropped; None keeps all.
         simplifier: Configuration and network; None for the defaults.
-        workers: Call functions for ranges of the file and for blocks; None calls them one after
-            the other in this process.
+        workers: Call functions for blocks; None calls them in this process.
         overwrite: Whether files of an earlier stream may be replaced.
         listener: Called with progress events.
 

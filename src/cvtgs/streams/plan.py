@@ -157,8 +157,7 @@ def plan_stream(
 
     Raises:
         InvalidArgumentError: There is no level, two have the same size, they are of scenes of
-            different sizes, chunks would be empty, or the distance of the environment is no number
-            from 0.
+            different sizes, or a number is out of range.
 
     Example:
         >>> from cvtgs import Simplifier, synthetic

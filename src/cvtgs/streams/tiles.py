@@ -129,13 +129,12 @@ def write_tiles(
     overwrite: bool = False,
     listener: ProgressListener = silent,
 ) -> tuple[StreamLevel, ...]:
-    """Write 3D Tiles.
+    """Write 3D Tiles, all files or none.
 
     The root holds the coarsest level of the whole scene. Finer tiles of its parts replace a tile,
     down to the finest level of single chunks. Tiles use the axes of glTF, and boxes use those of
-    3D Tiles (z up). Both are relative to the transform of the tile, which moves the median of its
-    positions into place, so that they keep their digits far from the origin. All files are
-    written, or none.
+    3D Tiles (z up). The transform of a tile moves the median of its positions into place, so that
+    they keep their digits far from the origin.
 
     Args:
         plan: Levels and chunks.
@@ -148,12 +147,11 @@ def write_tiles(
         listener: Called after each tile.
 
     Returns:
-        The written counts of each level, the finest first. A level may occur at several depths of
-        the tree; each of its tiles is counted once.
+        The written counts of each level, the finest first; it may be at several depths of the tree.
 
     Raises:
-        InvalidArgumentError: The transform is not affine and invertible, tiles would be empty, the
-            plan has an environment, which 3D Tiles cannot hold, or an argument has another type.
+        InvalidArgumentError: The transform is not affine and invertible, or the plan has an
+            environment, which 3D Tiles cannot hold.
         OutputExistsError: The folder holds files that may not be replaced.
         OutputError: A file cannot be written.
         InvalidSceneError: No Gaussian of a tile is finite.
@@ -191,9 +189,6 @@ def geo_transform(longitude: float, latitude: float, height: float = 0.0) -> tup
 
     Returns:
         16 numbers, column by column.
-
-    Raises:
-        InvalidArgumentError: A coordinate is out of range or not finite.
 
     Example:
         >>> [round(number) for number in geo_transform(0.0, 0.0)[12:]]

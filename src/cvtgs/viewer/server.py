@@ -168,7 +168,7 @@ class ViewerServer:
         MissingDependencyError: viser is not installed.
         ConfigError: The preset does not exist.
         InvalidArgumentError: The ratio is out of range, the host is not this machine, or no port
-            is free or may be opened.
+            is free.
     """
 
     def __init__(
