@@ -33,8 +33,9 @@ def _are_texts(values: object) -> bool:
 
 
 def _are_pairs(values: object) -> bool:
-    is_list = isinstance(values, tuple | list)
-    return is_list and all(_are_texts(value) and len(value) == 2 for value in values)
+    if not isinstance(values, tuple | list):
+        return False
+    return all(_are_texts(value) and len(value) == 2 for value in values)
 
 
 def _rebuilt(kind: type["GaussianScene"], values: dict[str, Any]) -> "GaussianScene":

@@ -235,10 +235,11 @@ def test_files_hold_as_many_chunks_as_fit_or_one(counts, files):
 def test_every_block_with_rows_has_a_gaussian_at_every_level(tmp_path: Path) -> None:
     job = SimpleNamespace(
         source=SimpleNamespace(count=14),
+        level_counts=(14, 6, 2),
         write_file=lambda name, content: (tmp_path / name).write_bytes(content),
     )
     share = vars(blocks)["_write_targets"]
-    share(SimpleNamespace(job=job), [14, 6, 2], [12, 0, 1, 1], [[12.0, 0.0, 1.0, 1.0]] * 3)
+    share(job, [12, 0, 1, 1], [[12.0, 0.0, 1.0, 1.0]] * 3)
     found = json.loads((tmp_path / "targets.json").read_text())["targets"]
     assert found == [[12, 4, 1], [0, 0, 0], [1, 1, 1], [1, 1, 1]]
 

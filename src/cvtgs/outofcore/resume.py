@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from cvtgs.clock import StageClock
 from cvtgs.config.base import Record
@@ -17,6 +18,8 @@ from cvtgs.mergenet import Checkpoint, encode_checkpoint
 from cvtgs.outofcore.job import Job
 from cvtgs.processes import Workers
 from cvtgs.text import size_text
+
+AnyJob = TypeVar("AnyJob", bound=Job)
 
 EXTRA_BYTES = 12  # of the files of blocks for each Gaussian, beyond those of the source
 
@@ -86,8 +89,8 @@ def _stamp(path: str) -> tuple[int, int] | None:
 
 
 def in_folder(
-    job: Job, output: str | os.PathLike[str], *, key_of: Callable[[Job], str], adapts: bool
-) -> Job:
+    job: AnyJob, output: str | os.PathLike[str], checkpoint: Checkpoint | None, *, adapts: bool
+) -> AnyJob:
     """Return a job with its folder, which is named by its key: late workers use that of their job.
 
     One that adapts gets the sizes of an interrupted run of it, unless that needs more memory.
@@ -101,10 +104,10 @@ def in_folder(
         earlier = replace(job, **sizes.model_dump())
         fits = earlier.blocks >= job.blocks and earlier.sample_rows <= job.sample_rows
         fits = fits and earlier.cell_room <= job.cell_room
-        if fits and key_of(earlier)[:16] == path.parent.name:
+        if fits and earlier.key(checkpoint)[:16] == path.parent.name:
             job = earlier
             break
-    return replace(job, folder=str(parent / key_of(job)[:16]))
+    return replace(job, folder=str(parent / job.key(checkpoint)[:16]))
 
 
 def can_continue(output: str | os.PathLike[str]) -> bool:

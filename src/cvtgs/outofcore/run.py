@@ -182,8 +182,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         ),
         cameras=cameras if simplifier.config.uses_images else None,
     )
-    key_of = partial(Job.key, checkpoint=simplifier.checkpoint)
-    job = in_folder(job, output, key_of=key_of, adapts=blocks is None)
+    job = in_folder(job, output, simplifier.checkpoint, adapts=blocks is None)
     clock = StageClock(listener, HOST)
     with output_lock(output), without_autocast():
         resumes = job.can_resume()

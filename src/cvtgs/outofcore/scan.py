@@ -357,10 +357,9 @@ def _named_fields(part: SceneScan | RobustFrame | KdPartition, prefix: str = "")
 def read_scan(path: Path) -> SceneScan:
     """Read a scan that :func:`write_scan` wrote."""
     tensors, texts = map_tensors(path)
-    values = {**tensors, **json.loads(texts["values"])}
-    parts = {
-        "frame": RobustFrame(**under_prefix("frame.", values)),
-        "partition": KdPartition(**under_prefix("partition.", values)),
-        "plan": EffectPlan.model_validate(values.pop("plan")),
-    }
-    return SceneScan(**{name: one for name, one in values.items() if "." not in name}, **parts)
+    values: dict[str, Any] = {**tensors, **json.loads(texts["values"])}
+    frame = RobustFrame(**under_prefix("frame.", values))
+    partition = KdPartition(**under_prefix("partition.", values))
+    plan = EffectPlan.model_validate(values.pop("plan"))
+    rest = {name: value for name, value in values.items() if "." not in name}
+    return SceneScan(frame=frame, partition=partition, plan=plan, **rest)

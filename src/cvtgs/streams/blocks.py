@@ -25,6 +25,7 @@ from cvtgs.io.axes import SCENE_AXES, checked_axes
 from cvtgs.io.files import check_degree
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
+from cvtgs.mergenet import Checkpoint
 from cvtgs.outofcore import Workers
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.memory import check_memory, chosen_blocks, memory_to_plan, sample_rows
@@ -44,8 +45,6 @@ from cvtgs.streams.files import (
     check_stream,
     join_levels,
     publish,
-    warn_of_losses,
-    write_index,
 )
 from cvtgs.streams.plan import CHUNK_GAUSSIANS, check_environment, near_rows, plan_part
 from cvtgs.streams.shares import block_shares
@@ -78,48 +77,59 @@ class BlockLevel(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StreamJob:
-    """Description of the whole job, small enough to be sent to every process."""
+class StreamJob(Job):
+    """Description of the whole job of a stream; its blocks are written as parts."""
 
-    job: Job  # the input file, its blocks, and the folder of their files
     form: StreamFormat
+    level_counts: tuple[int, ...]  # Gaussians to keep at each level, the finest first
     chunk_gaussians: int  # of the finest level in a chunk
-    axes: tuple[str, str]  # of the input file and of the output
+    file_axes: tuple[str, str]  # of the input file and of the output
     sh_degree: int | None  # the highest to keep; None keeps all
     environment_radii: float | None  # beyond these, Gaussians are the environment; None for none
 
+    def key(self, checkpoint: Checkpoint | None) -> str:
+        """Return a digest of everything the result depends on."""
+        options = (self.form, self.chunk_gaussians, self.file_axes, self.sh_degree)
+        choices = repr((*options, self.environment_radii))
+        facts = [Job.key(self, checkpoint), self.level_counts, choices]
+        return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+
     @property
-    def folder(self) -> Path:
+    def output(self) -> Path:
         """Folder that holds the files of the stream until all are written."""
-        return self.job.path("stream")
+        return self.path("stream")
 
     def part_path(self, block: int) -> Path:
         """Return the path of the JSON file with the :class:`StreamPart` of a block."""
-        return self.job.path("part", block, suffix=".json")
+        return self.path("part", block, suffix=".json")
 
-    def finished(self, block: int) -> StreamPart | None:
-        """Return the written part of a block; None unless all its files are complete."""
+    def read_part(self, block: int) -> StreamPart:
+        """Read the written part of a block."""
+        return StreamPart.model_validate_json(self.part_path(block).read_bytes())
+
+    def has_part(self, block: int) -> bool:
+        """Return whether a part is written, and all its files are complete."""
         try:
-            part = StreamPart.model_validate_json(self.part_path(block).read_bytes())
-            size = sum(_bytes_of(self.folder / name, self.form.kind) for name in part.names)
-            has_far = all((self.folder / name).exists() for name in part.environments.values())
+            part = self.read_part(block)
+            size = sum(_bytes_of(self.output / name, self.form.kind) for name in part.names)
+            has_far = all((self.output / name).exists() for name in part.environments.values())
         except (OSError, ValueError):
-            return None
-        return part if has_far and size == sum(level.bytes for level in part.levels) else None
+            return False
+        return has_far and size == sum(level.bytes for level in part.levels)
 
-    def targets(self) -> list[list[int]]:
+    def block_counts(self) -> list[list[int]]:
         """Return the number of Gaussians of each block at each level, the finest first."""
-        found: list[list[int]] = json.loads(self.job.path("targets.json").read_bytes())["targets"]
+        found: list[list[int]] = json.loads(self.path("targets.json").read_bytes())["targets"]
         return found
 
     def can_resume(self) -> bool:
         """Return whether the folder holds all sorted rows, their scan, and the targets."""
         try:
-            self.job.read_scan()
-            self.targets()
+            self.read_scan()
+            self.block_counts()
         except (OSError, ValueError, KeyError, TypeError):
             return False
-        return self.job.has_sorted_rows()
+        return self.has_sorted_rows()
 
 
 def _bytes_of(path: Path, kind: str) -> int:
@@ -214,7 +224,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
     merged = [target for target in targets if target < rows.count] or targets
     room = memory or memory_to_plan()
     merging = finer_count(merged[0], rows.count, simplifier.config.allocation)
-    job = Job(
+    job = StreamJob(
         folder="",
         source=rows,
         target=merged[0],
@@ -224,29 +234,20 @@ def stream_file(  # noqa: PLR0913 (options by name)
         has_network=simplifier.checkpoint is not None,
         range_rows=rows_per_range(rows.count),
         sample_rows=sample_rows(room),
-    )
-    choices = repr((form, chunk_gaussians, axes, sh_degree, environment_radii))
-
-    def key_of(job: Job) -> str:
-        facts = [job.key(simplifier.checkpoint), targets, choices]
-        return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
-
-    spec = StreamJob(
-        job=in_folder(job, folder, key_of=key_of, adapts=blocks is None),
         form=form,
+        level_counts=tuple(targets),
         chunk_gaussians=chunk_gaussians,
-        axes=axes,
+        file_axes=axes,
         sh_degree=sh_degree,
         environment_radii=environment_radii,
     )
+    job = in_folder(job, folder, simplifier.checkpoint, adapts=blocks is None)
     check_stream(folder, kind, overwrite=overwrite)
-    lock = output_lock(Path(spec.job.folder).parent)  # commands lock the output folder
+    lock = output_lock(Path(job.folder).parent)  # commands lock the output folder
     with lock, without_autocast():
-        parts, resumed = _run(spec, targets, simplifier, workers, StageClock(listener, HOST))
-        write_index(form, parts, spec.folder)
-        warn_of_losses(parts, Path(folder))
-        publish(spec.folder, Path(folder), kind, overwrite=overwrite)
-        spec.job.remove()
+        parts, resumed = _run(job, simplifier.checkpoint, workers, StageClock(listener, HOST))
+        publish(form, parts, job.output, Path(folder), overwrite=overwrite)
+        job.remove()
     chunks = sum(part.chunks for part in parts)
     return StreamReport(join_levels(parts), chunks, len(parts), resumed)
 
@@ -282,73 +283,63 @@ def _format(
 
 
 def _run(
-    spec: StreamJob,
-    targets: Sequence[int],
-    simplifier: Simplifier,
-    workers: Workers,
-    clock: StageClock,
+    job: StreamJob, checkpoint: Checkpoint | None, workers: Workers, clock: StageClock
 ) -> tuple[list[StreamPart], int]:
     """Sort the file and write the missing parts; return all parts and the number resumed."""
-    job = spec.job
-    resumes = spec.can_resume()
-    with started(job, workers, clock, simplifier.checkpoint, resumes=resumes):
+    resumes = job.can_resume()
+    with started(job, workers, clock, checkpoint, resumes=resumes):
         if not resumes:
             with one_thread():
                 found = sort_into_blocks(job, workers, clock, keep_all=True)
                 with clock.stage("allocate"):
-                    ratios = [target / sum(found.rows) for target in targets]
-                    shares = block_shares(job, ratios, found.cells, sh_degree=spec.sh_degree)
-            _write_targets(spec, targets, found.rows, shares)
-    make_folder(spec.folder)
-    blocks = [block for block, counts in enumerate(spec.targets()) if counts[0]]
-    unfinished = [block for block in blocks if spec.finished(block) is None]
+                    ratios = [count / sum(found.rows) for count in job.level_counts]
+                    shares = block_shares(job, ratios, found.cells, sh_degree=job.sh_degree)
+            _write_targets(job, found.rows, shares)
+    make_folder(job.output)
+    blocks = [block for block, counts in enumerate(job.block_counts()) if counts[0]]
+    unfinished = [block for block in blocks if not job.has_part(block)]
     with clock.stage("blocks", len(unfinished)) as advance:
-        for _ in with_progress(workers(partial(write_block, spec), unfinished), advance):
-            pass
-    parts = [StreamPart.model_validate_json(spec.part_path(block).read_bytes()) for block in blocks]
-    return parts, len(blocks) - len(unfinished)
+        list(with_progress(workers(partial(write_block, job), unfinished), advance))
+    return [job.read_part(block) for block in blocks], len(blocks) - len(unfinished)
 
 
-def _write_targets(
-    spec: StreamJob, targets: Sequence[int], rows: Sequence[int], shares: Sequence[Sequence[float]]
-) -> None:
+def _write_targets(job: StreamJob, rows: Sequence[int], shares: Sequence[Sequence[float]]) -> None:
     """Divide every level among the blocks; blocks with rows get at least one Gaussian."""
-    total = sum(rows)
-    if total < spec.job.source.count:
-        scan = spec.job.read_scan()
-        warn_of_dropped(spec.job.source.count - total, spec.job.source.count, scan.invalid_rows)
+    invalid = job.source.count - sum(rows)
+    if invalid:
+        warn_of_dropped(invalid, job.source.count, job.read_scan().invalid_rows)
     rooms, levels = list(rows), []
-    for target, parts in zip(targets, shares, strict=True):
+    for target, parts in zip(job.level_counts, shares, strict=True):
         least = sum(1 for room in rooms if room)
         rooms = shared_out(max(least, min(target, sum(rooms))), parts, rooms=rooms)
         levels.append(rooms)
     content = json.dumps({"targets": list(zip(*levels, strict=True))})
-    spec.job.write_file("targets.json", content.encode())
+    job.write_file("targets.json", content.encode())
 
 
 @one_thread()
-def write_block(spec: StreamJob, block: int) -> None:
+def write_block(job: StreamJob, block: int) -> None:
     """Simplify a block to all of its sizes, and write it as a part of the stream."""
-    job, targets = spec.job, spec.targets()[block]
     rows = read_rows(job, block)
     net = job.read_network(rows.scene.dtype)
     scene = select_columns(rows.scene, job.config.effects)
     scan = job.read_scan()
     analysis = analysis_of(scan, rows)
-    if spec.sh_degree is not None:
-        scene = scene.with_sh_degree(spec.sh_degree)
+    if job.sh_degree is not None:
+        scene = scene.with_sh_degree(job.sh_degree)
     levels: list[BlockLevel] = []
     clock = StageClock(silent, scene.device)
-    for target in targets:
+    for target in job.block_counts()[block]:
         if target >= len(scene):
             whole = restore_comments(with_finite_opacities(scene), scene, analysis.plan)
             levels.append(BlockLevel(whole, 0.0))
             continue
         reduced = reduce_scene(scene, analysis, target, job.config, net=net, clock=clock)
         levels.append(BlockLevel(reduced.scene, *level_facts(scene, analysis, reduced)))
-    near = near_rows(levels[-1].scene, scan.frame, spec.environment_radii)
-    if spec.axes[0] != spec.axes[1]:
-        levels = [level._replace(scene=change_axes(level.scene, *spec.axes)) for level in levels]
-    plan = plan_part(levels, near, chunk_gaussians=spec.chunk_gaussians)
-    part = spec.form.write_part(plan, spec.folder, part=block, listener=silent)
-    job.write_file(spec.part_path(block).name, part.model_dump_json().encode())
+    near = near_rows(levels[-1].scene, scan.frame, job.environment_radii)
+    axes = job.file_axes
+    if axes[0] != axes[1]:
+        levels = [level._replace(scene=change_axes(level.scene, *axes)) for level in levels]
+    plan = plan_part(levels, near, chunk_gaussians=job.chunk_gaussians)
+    part = job.form.write_part(plan, job.output, part=block, listener=silent)
+    job.write_file(job.part_path(block).name, part.model_dump_json().encode())

@@ -100,21 +100,13 @@ def write_stream(
     try:
         make_folder(hidden)
         part = form.write_part(plan, hidden, part=0, listener=listener)
-        write_index(form, [part], hidden)
-        warn_of_losses([part], place)
-        publish(hidden, place, form.kind, overwrite=overwrite)
+        publish(form, [part], hidden, place, overwrite=overwrite)
     finally:
         shutil.rmtree(hidden, ignore_errors=True)
     return part.levels
 
 
-def write_index(form: StreamFormat, parts: Sequence[StreamPart], folder: Path) -> None:
-    """Write the index of the parts in a folder."""
-    content = json.dumps(form.index(parts, folder), separators=(",", ":"))
-    write_atomically(folder / INDEX_NAMES[form.kind], content.encode(), overwrite=True)
-
-
-def warn_of_losses(parts: Sequence[StreamPart], place: Path) -> None:
+def _warn_of_losses(parts: Sequence[StreamPart], place: Path) -> None:
     """Warn once of data that the files of the parts do not hold, with the sums of their counts."""
     dropped = Counter[str]()
     for part in parts:
@@ -170,13 +162,24 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
         )
 
 
-def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
-    """Move the files of a finished stream, but hidden ones, to the output folder, the index last.
+def publish(
+    form: StreamFormat, parts: Sequence[StreamPart], hidden: Path, place: Path, *, overwrite: bool
+) -> None:
+    """Write the index of all parts, and move their files to the output folder."""
+    index = INDEX_NAMES[form.kind]
+    content = json.dumps(form.index(parts, hidden), separators=(",", ":"))
+    write_atomically(hidden / index, content.encode(), overwrite=True)
+    _warn_of_losses(parts, place)
+    check_stream(place, form.kind, overwrite=overwrite)
+    _move(hidden, place, index)
+
+
+def _move(hidden: Path, place: Path, index: str) -> None:
+    """Move the files of a stream, but hidden ones, to the output folder, the index last.
 
     Replaced files are set aside, the index first, which thus never names files of another stream.
     """
-    check_stream(place, kind, overwrite=overwrite)
-    index, target = INDEX_NAMES[kind], Path(os.path.realpath(place))
+    target = Path(os.path.realpath(place))
     try:
         if not target.exists():  # then one rename publishes all files
             replace_file(hidden, target)
