@@ -142,18 +142,14 @@ class Answers:
             return self.answer
 
 
-def answer(**changes):
-    found = distributed._Worker(distributed._versions(), 10_000, sees_folder=True)
-    return found._replace(**changes)
-
-
 @pytest.mark.parametrize(
     ("found", "error", "text"),
     [
-        (answer(versions={"cvtgs": "0.0.1"}), None, "found cvtgs 0.0.1 instead of "),
-        (answer(source_bytes=None), None, "must see the input .* found none"),
-        (answer(source_bytes=7), None, "found 7 bytes"),
-        (answer(sees_folder=False), None, "must be able to read and write the output folder"),
+        (
+            "must see the input in.ply, found none",
+            None,
+            ": this worker must see the input in.ply, ",
+        ),
         (None, ModuleNotFoundError("No module named 'cvtgs'"), "must have cvtgs .*No module named"),
     ],
 )
@@ -162,8 +158,6 @@ def test_the_error_names_a_worker_that_cannot_do_the_job(tmp_path, monkeypatch, 
     monkeypatch.setattr(package, "wait", lambda futures, timeout: None)
     source = tmp_path / "in.ply"
     cvtgs.save(cvtgs.synthetic.scene("object", 300, sh_degree=0, seed=1), source)
-    if found is not None and found.source_bytes == 10_000:
-        found = found._replace(source_bytes=source.stat().st_size)
     with pytest.raises(RunError, match=text) as caught:
         simplify_file(
             source, tmp_path / "out.ply", 0.1, blocks=2,
@@ -173,22 +167,32 @@ def test_the_error_names_a_worker_that_cannot_do_the_job(tmp_path, monkeypatch, 
     assert "\n" not in str(caught.value)
 
 
-def test_a_worker_reports_which_files_it_can_see(tmp_path):
+def test_a_worker_says_what_it_lacks(tmp_path):
     folder = tmp_path / ".out.ply.blocks" / "key"
     folder.mkdir(parents=True)
     (tmp_path / "in.ply").write_bytes(b"12345")
     (folder / "probe").write_text("token")
-    look = distributed._inspect
-    assert look(str(tmp_path / "in.ply"), str(folder / "probe"), "token") == (
-        distributed._versions(), 5, True,
-    )  # fmt: skip
-    assert not look("none.ply", str(folder / "probe"), "another").sees_folder
-    assert look("none.ply", "/nowhere/at/all/probe", "token")[1:] == (None, False)
+    versions, source = distributed._versions(), str(tmp_path / "in.ply")
+    problem, probe = distributed._problem, str(folder / "probe")
+    assert problem(versions, source, 5, probe, "token") == ""
+    others = problem({**versions, "cvtgs": "0.0.1"}, source, 5, probe, "token")
+    assert f"found cvtgs {cvtgs.__version__} instead of 0.0.1; install" in others
+    assert problem(versions, "no.ply", 5, probe, "token") == (
+        "must see the input no.ply of 5 bytes under the same path, found none"
+    )
+    assert problem(versions, source, 7, probe, "token").endswith(", found 5 bytes")
+    for place, wanted in ((probe, tmp_path), ("/nowhere/at/all/probe", "/nowhere")):
+        text = problem(versions, source, 5, place, "another")
+        assert text == (
+            "must be able to read and write the output folder under the same path, found no access "
+            f"to {wanted}"
+        )
 
 
 def test_a_worker_that_joins_later_with_another_version_is_refused():
     assert distributed._call(abs, distributed._versions(), -3) == 3
-    with pytest.raises(RunError, match="must have the same package versions as this process"):
+    wanted = "a worker must have the same package versions as its caller, found cvtgs .* instead"
+    with pytest.raises(RunError, match=wanted):
         distributed._call(abs, {"cvtgs": "0.0.1"}, -3)
 
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -63,51 +63,48 @@ def connect(address: str) -> "Client":
         raise RunError(f"{address}: no scheduler answers there: {reason}.") from error
 
 
-class _Worker(NamedTuple):
-    """What a worker sees: versions, the size of the source (None: no source), and the folder."""
-
-    versions: dict[str, str]
-    source_bytes: int | None
-    sees_folder: bool
-
-
 def _versions() -> dict[str, str]:
     python = ".".join(platform.python_version_tuple()[:2])
     return {"cvtgs": cvtgs.__version__, "torch": torch.__version__, "Python": python}
 
 
-def _inspect(source: str, probe: str, token: str) -> _Worker:
-    """Return the state of the worker that this runs on; wait for shared disks to show the probe."""
+def _other_versions(versions: dict[str, str]) -> str:
+    """Return what is wrong with the packages of this worker; empty if nothing is."""
+    pairs = [(name, own, versions.get(name, "none")) for name, own in _versions().items()]
+    wrong = ", ".join(
+        f"{name} {own} instead of {wanted}" for name, own, wanted in pairs if own != wanted
+    )
+    advice = "install the same versions there"
+    return wrong and f"must have the same package versions as its caller, found {wrong}; {advice}"
+
+
+def _problem(versions: dict[str, str], source: str, size: int, probe: str, token: str) -> str:
+    """Return why this worker cannot do a job; wait for shared disks to show it the probe."""
     path, deadline = Path(probe), time.monotonic() + _SHARE_SECONDS
     while not path.exists() and path.parent.parent.parent.is_dir() and time.monotonic() < deadline:
         time.sleep(0.2)
+    if problem := _other_versions(versions):
+        return problem
+    try:
+        found = f"{Path(source).stat().st_size} bytes"
+    except OSError:
+        found = "none"
+    if found != f"{size} bytes":
+        return f"must see the input {source} of {size} bytes under the same path, found {found}"
     try:
         sees_folder = path.read_text(encoding="ascii") == token and os.access(path.parent, os.W_OK)
     except (OSError, ValueError):
         sees_folder = False
-    try:
-        size = Path(source).stat().st_size
-    except OSError:
-        size = None
-    return _Worker(_versions(), size, sees_folder)
+    folder = path.parent.parent.parent
+    wanted = "must be able to read and write the output folder under the same path"
+    return "" if sees_folder else f"{wanted}, found no access to {folder}"
 
 
 def _call(function: Callable[[Any], Any], versions: dict[str, str], item: Any) -> Any:
     """Call a function on a worker; raise if the worker joined late and has other versions."""
-    if versions != _versions():
-        raise RunError(_differs("a worker", _versions()))
+    if problem := _other_versions(versions):
+        raise RunError(f"a worker {problem}.")
     return function(item)
-
-
-def _differs(worker: str, found: dict[str, str]) -> str:
-    pairs = [(name, own, found.get(name, "none")) for name, own in _versions().items()]
-    wrong = ", ".join(
-        f"{name} {other} instead of {own}" for name, own, other in pairs if own != other
-    )
-    return (
-        f"{worker}: must have the same package versions as this process, found {wrong}; "
-        "install the same versions there."
-    )
 
 
 class ClusterWorkers:
@@ -136,16 +133,17 @@ class ClusterWorkers:
                     raise _has_no_cvtgs(address, version)
             probe.write_text(token, encoding="ascii")
             try:
-                for address, seen in self._ask(
-                    addresses, _inspect, job.source.path, str(probe), token
-                ):
-                    _check_sight(address, seen, job)
+                source, size = job.source.path, Path(job.source.path).stat().st_size
+                facts = (_versions(), source, size, str(probe), token)
+                for address, problem in self._ask(addresses, _problem, *facts):
+                    if problem:
+                        raise RunError(f"{address}: this worker {problem}.")
             finally:
                 probe.unlink(missing_ok=True)
         return len(addresses)
 
     def _ask(
-        self, addresses: Sequence[str], function: Callable[..., Any], *arguments: str
+        self, addresses: Sequence[str], function: Callable[..., Any], *arguments: Any
     ) -> Iterator[tuple[str, Any]]:
         """Call a function on every worker; yield the answers, or raise if there is none."""
         from distributed import wait  # noqa: PLC0415 (optional)
@@ -243,25 +241,6 @@ def _has_no_cvtgs(address: str, found: str) -> RunError:
         f"{address}: this worker must have cvtgs {cvtgs.__version__}, found {found}; "
         "install it in the environment of every worker."
     )
-
-
-def _check_sight(address: str, found: _Worker, job: Job) -> None:
-    """Raise if a worker has other packages, or does not see the files of a job."""
-    if found.versions != _versions():
-        raise RunError(_differs(address, found.versions))
-    size = Path(job.source.path).stat().st_size
-    if found.source_bytes != size:
-        seen = "none" if found.source_bytes is None else f"{found.source_bytes} bytes"
-        raise RunError(
-            f"{address}: this worker must see the input {job.source.path} of {size} bytes under "
-            f"the same path, found {seen}."
-        )
-    if not found.sees_folder:
-        folder = Path(job.folder).parent.parent
-        raise RunError(
-            f"{address}: this worker must be able to read and write the output folder under the "
-            f"same path, found no access to {folder}."
-        )
 
 
 @contextmanager
