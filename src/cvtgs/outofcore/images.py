@@ -159,7 +159,7 @@ class Drawn(NamedTuple):
 @one_thread()
 def improve(job: Job, block: int) -> None:
     """Match a block to images and refine it, unless fewer than two given cameras show it."""
-    if job.improved_path(block).exists():
+    if job.finished_path(block).exists():
         return
     own, found, config = load(job.small_path(block)), read_cells(job, block), job.config
     drawn = _draw(job, block, own, found)

@@ -1,14 +1,15 @@
-"""The job of an out-of-core run: all data that a process needs, and the paths of block files."""
+"""The job of an out-of-core run: all data that a process needs, and its folder of block files."""
 
 import hashlib
 import json
 import os
 import shutil
 import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -16,19 +17,26 @@ from torch import Tensor
 import cvtgs
 from cvtgs.boxes import Box
 from cvtgs.cameras import Cameras
+from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
-from cvtgs.errors import CvtgsError, OutputError, reason_of
+from cvtgs.errors import CvtgsError, InputError, OutputError, reason_of, warn
 from cvtgs.io.atomic import write_atomically
 from cvtgs.io.axes import SCENE_AXES
+from cvtgs.io.files import is_file, is_folder
+from cvtgs.io.locks import hidden_path, lock_path, output_lock
 from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors, save_tensors
-from cvtgs.mergenet import Checkpoint, Net, load_checkpoint
+from cvtgs.mergenet import Checkpoint, Net, encode_checkpoint, load_checkpoint
 from cvtgs.outofcore.memory import CELL_ROOM
 from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, write_scan
+from cvtgs.processes import Workers
+from cvtgs.text import size_text
 
 SENT_BYTES = "sent_bytes"  # entry of the label file of a block: bytes of the file of its sent rows
 
+
+EXTRA_BYTES = 12  # of the files of blocks for each Gaussian, beyond those of the source
 
 FILES_VERSION = 11
 """Number of the layout of these files: raise it with every change, so that no run continues with
@@ -109,16 +117,12 @@ class Job:
         return self.path("views.safetensors")
 
     def small_path(self, block: int) -> Path:
-        """Return the file of a finished block."""
+        """Return the file of a simplified block."""
         return self.path("small", block, suffix=".ply")
 
-    def improved_path(self, block: int) -> Path:
-        """Return the file of a finished block that was matched to images or refined."""
-        return self.path("improved", block, suffix=".ply")
-
     def finished_path(self, block: int) -> Path:
-        """Return the final file of a finished block."""
-        return self.improved_path(block) if self.uses_images else self.small_path(block)
+        """Return the final file of a block, which images may have improved."""
+        return self.path("improved" if self.uses_images else "small", block, suffix=".ply")
 
     @property
     def uses_images(self) -> bool:
@@ -186,8 +190,11 @@ class Job:
 
     def key(self, checkpoint: Checkpoint | None) -> str:
         """Return a digest of everything the result depends on: file, options, network, versions."""
-        path = Path(self.source.path)
+        path, cameras, views = Path(self.source.path), self.cameras, None
         stat = path.stat()
+        if cameras is not None:
+            views = [cameras.viewmats.tolist(), cameras.Ks.tolist(), cameras.width, cameras.height]
+            views += [cameras.strides, cameras.ignores_tag]
         with path.open("rb") as file:
             header = file.read(self.source.offset)
         inputs = {
@@ -201,7 +208,7 @@ class Job:
             "axes": [self.source.axes, self.axes],
             "sh_degree": self.source.sh_degree,
             "boxes": [box.model_dump() for box in self.boxes],
-            "cameras": None if self.cameras is None else _listed(self.cameras),
+            "cameras": views,
             "config": self.config.model_dump(),
             "network": checkpoint and checkpoint.digest,
             "versions": [cvtgs.__version__, torch.__version__, FILES_VERSION],
@@ -229,19 +236,6 @@ class Job:
             return all(self._is_whole(name, *facts) for name, facts in json.loads(text).items())
         except (OSError, ValueError, TypeError, AttributeError):
             return False
-
-    def start_over(self) -> None:
-        """Make an empty folder; remove files that earlier jobs of this output left."""
-        parent = Path(self.folder).parent
-        shutil.rmtree(parent, ignore_errors=True)
-        try:
-            Path(self.folder).mkdir(parents=True)
-        except OSError as error:
-            reason = reason_of(error)
-            raise OutputError(
-                f"{parent}: must be replaceable by an empty folder for block files, "
-                f"found: {reason}."
-            ) from error
 
     def remove(self) -> None:
         """Remove the folder of a finished job; if interrupted, nothing is left to continue with."""
@@ -286,7 +280,7 @@ class Job:
         for block in blocks:
             whole = True
             # The report of a small block that is made again would lack what its images changed.
-            for name in (self.small_path(block), self.improved_path(block)):
+            for name in (self.small_path(block), self.finished_path(block)):
                 try:
                     json.loads(self.report_path(block).read_bytes())
                     whole = whole and open_rows(name).count == self.targets[block]
@@ -296,7 +290,111 @@ class Job:
                     name.unlink(missing_ok=True)
 
 
-def _listed(cameras: Cameras) -> list[object]:
-    """Return everything about cameras that a result depends on."""
-    matrices = [cameras.viewmats.tolist(), cameras.Ks.tolist()]
-    return [*matrices, cameras.width, cameras.height, cameras.strides, cameras.ignores_tag]
+AnyJob = TypeVar("AnyJob", bound=Job)
+
+SIZES = ("blocks", "sample_rows", "cell_room")  # attributes of a job that its memory decides
+
+
+@contextmanager
+def started(
+    job: Job, workers: Workers, clock: StageClock, checkpoint: Checkpoint | None, *, resumes: bool
+) -> Iterator[None]:
+    """Make the folder of a job, unless it resumes; check the workers, and write the network.
+
+    The body sorts the rows; if it fails or the source changes meanwhile, the folder is removed.
+    """
+    before = _stamp(job.source.path)
+    try:
+        if not resumes:
+            _make_empty(Path(job.folder))
+            sizes = {name: getattr(job, name) for name in SIZES}
+            job.write_file("sizes.json", json.dumps(sizes).encode())
+            _warn_of_full_disk(job)
+        check: Callable[[Job], object] | None = getattr(workers, "check", None)
+        if check is not None:  # workers on other machines
+            with clock.stage("workers"):
+                check(job)
+        if checkpoint is not None:  # a resumed job may find it damaged
+            content = encode_checkpoint(checkpoint.net, checkpoint.info)
+            job.write_file("network.safetensors", content)
+        yield
+        if not resumes and _stamp(job.source.path) != before:
+            raise InputError(
+                f"{job.source.path}: must stay as it is while it is read, found it changed; start "
+                "again."
+            )
+    except BaseException:
+        if not resumes:
+            shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
+        raise
+
+
+def _make_empty(folder: Path) -> None:
+    """Make an empty folder; remove files that earlier jobs of this output left."""
+    shutil.rmtree(folder.parent, ignore_errors=True)
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise OutputError(
+            f"{folder.parent}: must be replaceable by an empty folder for block files, "
+            f"found: {reason_of(error)}."
+        ) from error
+
+
+def _warn_of_full_disk(job: Job) -> None:
+    """Warn if the files of the blocks will probably not fit on their disk."""
+    needed = job.source.count * (job.source.dtype.itemsize + EXTRA_BYTES)
+    with suppress(OSError):
+        free = shutil.disk_usage(job.folder).free
+        if free < needed:
+            warn(
+                f"{Path(job.folder).parent}: the files of the blocks take some "
+                f"{size_text(needed)}, but {size_text(free)} of the disk are free; write the "
+                f"output to a larger one."
+            )
+
+
+def _stamp(path: str) -> tuple[int, int] | None:
+    """Return size and time of a file; None if it does not exist any more."""
+    try:
+        stat = Path(path).stat()
+    except OSError:
+        return None
+    return stat.st_size, stat.st_mtime_ns
+
+
+def in_folder(
+    job: AnyJob, output: str | os.PathLike[str], checkpoint: Checkpoint | None, *, adapts: bool
+) -> AnyJob:
+    """Return a job with its folder, which is named by its key: late workers use that of their job.
+
+    One that adapts gets the sizes of an interrupted run of it, unless that needs more memory.
+    """
+    parent = hidden_path(output, "blocks")
+    for path in parent.glob("*/sizes.json") if adapts else ():
+        try:
+            found = json.loads(path.read_bytes())
+            sizes: dict[str, Any] = {name: int(found[name]) for name in SIZES}
+            earlier = replace(job, **sizes)
+        except (OSError, ValueError, KeyError, TypeError):
+            continue
+        fits = earlier.blocks >= job.blocks and earlier.sample_rows <= job.sample_rows
+        fits = fits and earlier.cell_room <= job.cell_room
+        if fits and earlier.key(checkpoint)[:16] == path.parent.name:
+            job = earlier
+            break
+    return replace(job, folder=str(parent / job.key(checkpoint)[:16]))
+
+
+def can_continue(output: str | os.PathLike[str]) -> bool:
+    """Return whether an interrupted run of an output has rows to continue with."""
+    return any(hidden_path(output, "blocks").glob("*/sorted.json"))
+
+
+def remove_job_files(output: str | os.PathLike[str], *, is_stream: bool = False) -> None:
+    """Remove the files that interrupted runs of an output left, unless another run uses them."""
+    folder = hidden_path(output, "blocks")
+    locked = folder if is_stream else output  # commands lock the output of a stream
+    if is_folder(folder) or is_file(lock_path(locked)):
+        with suppress(OutputError), output_lock(locked):
+            shutil.rmtree(folder, ignore_errors=True)

@@ -213,7 +213,7 @@ def write_block(
     job: Job, block: int, small: GaussianScene, report: BlockReport, *, is_improved: bool = False
 ) -> None:
     """Write a finished block; its report comes first, since the scene file marks it as finished."""
-    path = job.improved_path(block) if is_improved else job.small_path(block)
+    path = job.finished_path(block) if is_improved else job.small_path(block)
     axes = job.axes if path == job.finished_path(block) else SCENE_AXES
     job.write_file(job.report_path(block).name, report.model_dump_json().encode())
     with without_warnings():

@@ -32,7 +32,7 @@ from cvtgs.outofcore.images import (
     join_refinements,
     measure,
 )
-from cvtgs.outofcore.job import Job, Manifest
+from cvtgs.outofcore.job import Job, Manifest, in_folder, started
 from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
 from cvtgs.outofcore.memory import (
     IMAGE_BYTES,
@@ -44,7 +44,6 @@ from cvtgs.outofcore.memory import (
     warn_of_writing,
 )
 from cvtgs.outofcore.merge import correct, inflate, merge, read_report, simplify_block
-from cvtgs.outofcore.resume import in_folder, started
 from cvtgs.outofcore.rows import kept_rows
 from cvtgs.outofcore.scan import CHUNK, read_sample
 from cvtgs.outofcore.sort import sort_into_blocks

@@ -27,9 +27,8 @@ from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
 from cvtgs.mergenet import Checkpoint
 from cvtgs.outofcore import Workers
-from cvtgs.outofcore.job import Job
+from cvtgs.outofcore.job import Job, in_folder, started
 from cvtgs.outofcore.memory import check_memory, chosen_blocks, memory_to_plan, sample_rows
-from cvtgs.outofcore.resume import in_folder, started
 from cvtgs.outofcore.rows import analysis_of, read_rows
 from cvtgs.outofcore.run import check_config, rows_per_range
 from cvtgs.outofcore.sort import sort_into_blocks
