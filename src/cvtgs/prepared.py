@@ -53,17 +53,6 @@ class Prepared:
 
     ``Simplifier.prepare`` creates instances. Every run gives the bits of ``Simplifier.run``; the
     report of the first run includes the shared stages.
-
-    Args:
-        scene: The input scene.
-        config: The configuration.
-        checkpoint: Checkpoint of the network that corrects merged Gaussians; None for no network.
-        device: Device to compute on; None chooses as ``auto`` does.
-        cameras: Cameras for presets that render the scene; None generates views.
-        listener: Called with progress events.
-
-    Raises:
-        InvalidArgumentError: There are too few cameras for a preset that renders the scene.
     """
 
     def __init__(

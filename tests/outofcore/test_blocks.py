@@ -22,7 +22,6 @@ from cvtgs.outofcore import allocate, scan as scan_module, simplify_file
 from cvtgs.outofcore.memory import SMALL_BASE_BYTES, block_count, needed_memory, read_bytes
 from cvtgs.outofcore.scan import (
     RangeTotals,
-    RowRange,
     add_totals,
     in_cells,
     partition_space,
@@ -122,7 +121,7 @@ def test_no_block_has_much_more_than_twice_the_average_of_rows_or_weight(tmp_pat
     frame = robust_frame(scene.means)
     found = scan_scene(
         scene,
-        scan_range(open_rows(tmp_path / "in.ply"), frame, (), RowRange(0, 0, 1000)),
+        scan_range(open_rows(tmp_path / "in.ply"), frame, (), range(1000)),
         boxes=(),
         target=100,
         cell_count=100,
@@ -204,9 +203,9 @@ def test_the_size_of_ranges_does_not_matter(source, tmp_path):
 def test_sums_do_not_depend_on_ranges(scene, source, monkeypatch):
     monkeypatch.setattr("cvtgs.outofcore.scan.CHUNK", 10)
     rows, frame = open_rows(source), robust_frame(scene.means)
-    whole = scan_range(rows, frame, (), RowRange(0, 0, 6000))
+    whole = scan_range(rows, frame, (), range(6000))
     ends = range(0, 6001, 600)
-    parts = [scan_range(rows, frame, (), RowRange(0, *pair)) for pair in pairwise(ends)]
+    parts = [scan_range(rows, frame, (), range(*pair)) for pair in pairwise(ends)]
     by_part = sum(part.mass for part in parts), sum(part.falloff_mass for part in parts)
     assert by_part != (whole.mass, whole.falloff_mass)  # they are rounded differently
     total = add_totals(parts)

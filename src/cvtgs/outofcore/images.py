@@ -1,13 +1,10 @@
 """Images in blocks: contributions before cells form, then matching and refinement.
 
 Contributions are measured in images of the whole scene, from the same cameras for all blocks. A
-block is rendered with all of its Gaussians; a sample of the scene, enlarged to cover the same area,
-stands for the others.
+block is rendered with all of its Gaussians; an enlarged sample of the scene stands for the others.
 
-Finished blocks are matched and refined one by one. In images of the full scene, only the block
-itself shows all of its Gaussians; the other blocks show their simplified ones, fixed and the same
-as in images of the small scene. Only the block differs. With given cameras, its Gaussians are first
-grouped again, with more cells where the images err.
+Finished blocks are matched and refined one by one, in images of the full and the small scene that
+differ in this block only: the other blocks show their simplified Gaussians in both.
 """
 
 import json

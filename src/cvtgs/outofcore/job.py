@@ -29,7 +29,7 @@ from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.mergenet import Checkpoint, Net, encode_checkpoint, load_checkpoint
 from cvtgs.outofcore.memory import CELL_ROOM
-from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, write_scan
+from cvtgs.outofcore.scan import SAMPLE_ROWS, SceneScan, read_scan, write_scan
 from cvtgs.processes import Workers
 from cvtgs.text import size_text
 
@@ -139,11 +139,10 @@ class Job:
         """Return the file with the report of a finished block."""
         return self.path("small", block, suffix=".json")
 
-    def ranges(self) -> list[RowRange]:
-        """Return the ranges of the source."""
-        total, step = self.source.count, self.range_rows
-        starts = range(0, total, step)
-        return [RowRange(k, start, min(start + step, total)) for k, start in enumerate(starts)]
+    def ranges(self) -> list[range]:
+        """Return the rows of the source that one process reads in one call."""
+        rows, step = range(self.source.count), self.range_rows
+        return [rows[start : start + step] for start in rows[::step]]
 
     @property
     def cells(self) -> tuple[int, ...]:
@@ -167,11 +166,11 @@ class Job:
 
     def blocks_with_rows(self) -> list[int]:
         """Return the blocks with rows; the weight of some may be too small for a cell."""
-        numbers = [rows.number for rows in self.ranges()]
+        starts = [rows.start for rows in self.ranges()]
         return [
             block
             for block, count in enumerate(self.cells)
-            if count or any(self.path("rows", block, number).exists() for number in numbers)
+            if count or any(self.path("rows", block, start).exists() for start in starts)
         ]
 
     def read_network(self, dtype: torch.dtype) -> Net | None:

@@ -78,7 +78,7 @@ def read_members(job: Job, block: int) -> tuple[BlockRows, Tensor]:
 def kept_rows(job: Job) -> Iterator[NDArray[Any]]:
     """Map the protected rows of every range, in pieces."""
     for rows in job.ranges():
-        path = job.path("kept", rows.number)
+        path = job.path("kept", rows.start)
         if path.exists():
             table = np.memmap(path, job.source.dtype, "r").view(np.ndarray)
             yield from (table[start : start + CHUNK] for start in range(0, len(table), CHUNK))
@@ -122,7 +122,7 @@ def _row_pieces(job: Job, block: int) -> Iterator[NDArray[Any]]:
 
 def _row_files(job: Job, block: int) -> list[tuple[Path, int]]:
     size = record_type(job).itemsize
-    paths = [job.path("rows", block, rows.number) for rows in job.ranges()]
+    paths = [job.path("rows", block, rows.start) for rows in job.ranges()]
     return [(path, path.stat().st_size // size) for path in paths if path.exists()]
 
 

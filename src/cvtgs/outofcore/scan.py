@@ -112,14 +112,6 @@ DEVIATIONS = 4.0  # standard deviations of the number of rows that a filter from
 _GOLDEN = 0.6180339887498949  # multiples of it are spread evenly between whole numbers
 
 
-class RowRange(NamedTuple):
-    """Rows ``start`` to ``stop`` of the source, which one process reads in one call."""
-
-    number: int
-    start: int
-    stop: int
-
-
 class RangeTotals(NamedTuple):
     """Sums over the valid rows of a range; of masses by chunk, since their order changes bits."""
 
@@ -184,7 +176,7 @@ def _one_of(rows: NDArray[Any], step: int) -> NDArray[Any]:
 
 @one_thread()
 def scan_range(
-    source: PlyRows, frame: RobustFrame, boxes: tuple[Box, ...], rows: RowRange
+    source: PlyRows, frame: RobustFrame, boxes: tuple[Box, ...], rows: range
 ) -> RangeTotals:
     """Sum optical depths, masses and counts over a range of the source."""
     depths = empty_depth_grid(HOST)

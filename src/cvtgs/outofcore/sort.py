@@ -28,7 +28,6 @@ from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.rows import AREA, VISIBILITY, record_type
 from cvtgs.outofcore.scan import (
     CHUNK,
-    RowRange,
     SceneScan,
     add_totals,
     faint_masses,
@@ -98,7 +97,7 @@ def sort_into_blocks(
 
 
 def _scan(
-    job: Job, workers: Workers, ranges: Sequence[RowRange], advance: Callable[[int], None]
+    job: Job, workers: Workers, ranges: Sequence[range], advance: Callable[[int], None]
 ) -> tuple[int, SceneScan]:
     """Return the number of Gaussians that all blocks keep, and the scan of the scene."""
     sample = read_sample(job.source, job.sample_rows)
@@ -134,7 +133,7 @@ def _sort(
     job: Job,
     rest: int,
     workers: Workers,
-    ranges: Sequence[RowRange],
+    ranges: Sequence[range],
     advance: Callable[[int], None],
 ) -> SortedBlocks:
     rows, cells, files = [0] * job.blocks, [0.0] * job.blocks, list[SortedFile]()
@@ -160,7 +159,7 @@ class SortedCounts(NamedTuple):
 
 
 @one_thread()
-def sort_range(job: Job, rows: RowRange) -> SortedCounts:
+def sort_range(job: Job, rows: range) -> SortedCounts:
     """Write the rows of a range into one file per block, to which no other call writes."""
     scan, config, attempt = job.read_scan(), job.config.cvt, Attempt(job.folder)
     row_counts = torch.zeros(job.blocks, dtype=torch.int64)
@@ -172,7 +171,7 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
         protected = valid & inside(job.boxes, scene.means)
         if bool(protected.any()):
             kept = _kept_rows(records, scene, protected)
-            attempt.append(job.path("kept", rows.number).name, kept)
+            attempt.append(job.path("kept", rows.start).name, kept)
         free = (valid & ~protected).nonzero()[:, 0]
         chosen, areas, visibility = _filtered(scan, config, scene, free)
         if len(chosen) < len(free):
@@ -194,7 +193,7 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
         ends = added.cumsum(0).tolist()
         for block, (end, count) in enumerate(zip(ends, added.tolist(), strict=True)):
             if count:
-                name = job.path("rows", block, rows.number).name
+                name = job.path("rows", block, rows.start).name
                 attempt.append(name, table[end - count : end].tobytes())
     return SortedCounts(row_counts.tolist(), cell_counts, left_out, [*attempt.files.values()])
 

@@ -50,7 +50,7 @@ from cvtgs.streams.shares import block_shares
 from cvtgs.streams.sog import SogFormat
 from cvtgs.streams.tiles import TilesFormat, check_no_environment, check_transform
 from cvtgs.text import counted, shown
-from cvtgs.validity import warn_of_dropped, with_finite_opacities
+from cvtgs.validity import warn_of_dropped
 
 
 class StreamReport(NamedTuple):
@@ -329,12 +329,9 @@ def write_block(job: StreamJob, block: int) -> None:
     levels: list[BlockLevel] = []
     clock = StageClock(silent, scene.device)
     for target in job.block_counts()[block]:
-        if target >= len(scene):
-            whole = restore_comments(with_finite_opacities(scene), scene, analysis.plan)
-            levels.append(BlockLevel(whole, 0.0))
-            continue
         reduced = reduce_scene(scene, analysis, target, job.config, net=net, clock=clock)
-        levels.append(BlockLevel(reduced.scene, *level_facts(scene, analysis, reduced)))
+        small = restore_comments(reduced.scene, scene, analysis.plan)
+        levels.append(BlockLevel(small, *level_facts(scene, analysis, reduced)))
     near = near_rows(levels[-1].scene, scan.frame, job.environment_radii)
     axes = job.file_axes
     if axes[0] != axes[1]:

@@ -36,9 +36,13 @@ def block_shares(
     sample = select_columns(sample, job.config.effects)
     if sh_degree is not None:
         sample = sample.with_sh_degree(sh_degree)
-    analysis = _analyze(job, sample)
-    sample, partition = drop_unused_bands(sample, analysis.plan), job.read_scan().partition
-    blocks = partition.blocks_of(analysis.frame.contract(sample.means))
+    scan = job.read_scan()
+    visibility = visibility_at(scan.visibility, sample.means, scan.frame)
+    distances = scan.frame.distances(sample.means)
+    areas = apparent_areas(sample.areas, distances, visibility, config=job.config.cvt)
+    analysis = analysis_of(scan, BlockRows(sample, areas, visibility))
+    sample = drop_unused_bands(sample, scan.plan)
+    blocks = scan.partition.blocks_of(scan.frame.contract(sample.means))
     ordered, known = order_rows(sample, analysis, job.config), torch.tensor(weights).double()
     found = list[list[float]]()
     for ratio in ratios:
@@ -53,15 +57,6 @@ def block_shares(
         factors = (counts + PRIOR_CELLS) / (expected + PRIOR_CELLS)
         found.append((known * factors**POWER).tolist())
     return found
-
-
-def _analyze(job: Job, sample: GaussianScene) -> SceneAnalysis:
-    """Return the analysis of a sample, based on the scan of the whole scene."""
-    scan = job.read_scan()
-    visibility = visibility_at(scan.visibility, sample.means, scan.frame)
-    distances = scan.frame.distances(sample.means)
-    areas = apparent_areas(sample.areas, distances, visibility, config=job.config.cvt)
-    return analysis_of(scan, BlockRows(sample, areas, visibility))
 
 
 def _group(

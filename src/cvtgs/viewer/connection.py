@@ -4,7 +4,7 @@ import io
 import os
 import socket
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from http import HTTPStatus
 from importlib import import_module
 from inspect import isawaitable
@@ -41,11 +41,11 @@ def start_server(host: str, port: int) -> "viser.ViserServer":
     import viser  # noqa: PLC0415 (optional)
 
     address, port = _open_address(host, port)  # viser would wait for ever if it cannot listen
-    with redirect_stdout(io.StringIO()):  # viser prints even if verbose is False
-        if not ip_address(address.partition("%")[0]).is_loopback:
-            return viser.ViserServer(host=host, port=port, label="cvtgs", verbose=False)
-        with _refusing_other_sites({*_OWN_NAMES, host.lower(), address}):
-            return viser.ViserServer(host=host, port=port, label="cvtgs", verbose=False)
+    is_own_machine = ip_address(address.partition("%")[0]).is_loopback
+    names = {*_OWN_NAMES, host.lower(), address}
+    guard = _refusing_other_sites(names) if is_own_machine else nullcontext()
+    with redirect_stdout(io.StringIO()), guard:  # viser prints even if verbose is False
+        return viser.ViserServer(host=host, port=port, label="cvtgs", verbose=False)
 
 
 def stop_server(server: "viser.ViserServer") -> None:
