@@ -178,9 +178,9 @@ def test_unlike_scenes_are_filled_with_a_warning() -> None:
     [
         (
             lambda: Motion(scale=0.0),
-            "needs a scale above 0 and a quaternion of length 1e-100 to 1e100, found 0.0",
+            r"a scale above 0, and 3 of a shift, found \(1.0, 0.0, 0.0, 0.0\), 0.0, ",
         ),
-        (lambda: Motion(quat=(0.0,) * 4), "a quaternion of length 1e-100 to 1e100, found 1.0 and"),
+        (lambda: Motion(quat=(0.0,) * 4), "a quaternion of length 1e-100 to 1e100, a scale"),
         (lambda: Motion(quat=(1e-200,) * 4), "a quaternion of length 1e-100 to 1e100"),
         (lambda: Motion(quat=(1e200,) * 4), "a quaternion of length 1e-100 to 1e100"),
         (lambda: Motion(shift=(math.nan, 0, 0)), "must consist of finite numbers"),

@@ -197,30 +197,25 @@ def shared_out(total: int, shares: Sequence[float], *, rooms: Sequence[int]) -> 
         raise InvalidArgumentError(
             f"a count to split must be between {sum(least)} and {sum(rooms)}, found {total}."
         )
-    counts = list(least)
     exact = [Fraction(share) for share in shares]
-    fixed: set[int] = set()
+    counts = dict[int, int]()
     while True:
         # A quota outside its limits is fixed at the nearest limit; the others share the rest.
-        free = [k for k in range(len(rooms)) if k not in fixed]
-        left = total - sum(counts[k] for k in fixed)
+        free = [k for k in range(len(rooms)) if k not in counts]
+        left = total - sum(counts.values())
         weight = sum(exact[k] for k in free)
         quotas = {
             k: left * exact[k] / weight if weight else Fraction(left, len(free)) for k in free
         }
-        high = [k for k in free if quotas[k] > rooms[k]]
-        low = [k for k in free if quotas[k] < least[k]]
-        over = sum(quotas[k] - rooms[k] for k in high)
-        under = sum(least[k] - quotas[k] for k in low)
+        high = {k: rooms[k] for k in free if quotas[k] > rooms[k]}
+        low = {k: least[k] for k in free if quotas[k] < least[k]}
         if not high and not low:
             break
-        ends = rooms if over >= under else least
-        chosen = high if over >= under else low
-        counts = [ends[k] if k in chosen else counts[k] for k in range(len(rooms))]
-        fixed.update(chosen)
-    for k in free:
-        counts[k] = int(quotas[k])
+        over = sum(quotas[k] - end for k, end in high.items())
+        under = sum(end - quotas[k] for k, end in low.items())
+        counts |= high if over >= under else low
+    counts |= {k: int(quotas[k]) for k in free}
     by_remainder = sorted(free, key=lambda k: counts[k] - quotas[k])
-    for k in by_remainder[: total - sum(counts)]:
+    for k in by_remainder[: total - sum(counts.values())]:
         counts[k] += 1
-    return counts
+    return [counts[k] for k in range(len(rooms))]

@@ -45,17 +45,13 @@ class Motion:
     def __post_init__(self) -> None:
         quat, scale = finite_numbers(self.quat, 4), finite_numbers([self.scale], 1)
         shift = finite_numbers(self.shift, 3)
-        if quat is None or scale is None or shift is None:
+        # the square of the length must be a float64
+        is_usable = quat and scale and scale[0] > 0 and 1e-100 <= math.hypot(*quat) <= 1e100
+        if quat is None or scale is None or shift is None or not is_usable:
             found = ", ".join(map(shown, (self.quat, self.scale, self.shift)))
             raise InvalidArgumentError(
-                f"a motion must consist of finite numbers (4 of a quaternion, a scale, 3 of a "
-                f"shift), found {found}."
-            )
-        # the square of the length must be a float64
-        if scale[0] <= 0 or not 1e-100 <= math.hypot(*quat) <= 1e100:
-            raise InvalidArgumentError(
-                f"a motion needs a scale above 0 and a quaternion of length 1e-100 to 1e100, "
-                f"found {scale[0]} and {quat}."
+                "a motion must consist of finite numbers: 4 of a quaternion of length 1e-100 to "
+                f"1e100, a scale above 0, and 3 of a shift, found {found}."
             )
         for name, value in (("quat", quat), ("scale", scale[0]), ("shift", shift)):
             object.__setattr__(self, name, value)
