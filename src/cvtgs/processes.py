@@ -17,7 +17,6 @@ from multiprocessing import current_process, get_context
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from tempfile import NamedTemporaryFile, mkdtemp
-from types import TracebackType
 from typing import Any, NamedTuple, Protocol, Self, TypeVar, runtime_checkable
 
 from cvtgs.counts import checked_whole
@@ -88,12 +87,8 @@ class LocalWorkers:
 
     def __init__(self, count: int, remedy: str = "with less --memory or fewer --workers") -> None:
         count = checked_whole(count, "the number of processes")
-        self._count, self._remedy = pool_size(count), remedy
-
-    @property
-    def count(self) -> int:
-        """Number of processes."""
-        return self._count
+        self.count: int = pool_size(count)
+        self._remedy = remedy
 
     def __enter__(self) -> Self:
         from cvtgs.devices import core_count  # noqa: PLC0415 (loads torch; see _begin)
@@ -105,7 +100,7 @@ class LocalWorkers:
             )
         self._owner, self._warned = os.getpid(), set[str]()
         context = get_context("spawn")  # fork would copy locks that torch's threads hold
-        threads = max(1, core_count() // self._count)
+        threads = max(1, core_count() // self.count)
         with ExitStack() as stack:
             with _temporary_errors():
                 self._folder = mkdtemp(prefix="cvtgs-")
@@ -115,7 +110,7 @@ class LocalWorkers:
             settings = (self._watched, threads, self._folder)
             with _hangup_ignored():
                 self._pool = ProcessPoolExecutor(
-                    self._count, context, initializer=_begin, initargs=settings
+                    self.count, context, initializer=_begin, initargs=settings
                 )
                 stack.callback(self._pool.shutdown, cancel_futures=True)
                 stack.callback(self._end_processes)
@@ -123,12 +118,7 @@ class LocalWorkers:
             self._cleanup = stack.pop_all()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if os.getpid() != self._owner:  # in a process that a program has forked meanwhile
             self._alive.close()
             self._watched.close()
@@ -142,7 +132,7 @@ class LocalWorkers:
         self._starts = list[Future[int]]()
         try:
             with _interrupts_held(), _safe_path():
-                for _ in range(self._count):
+                for _ in range(self.count):
                     self._starts.append(self._pool.submit(os.getpid))
         except BrokenProcessPool as error:
             raise self._run_error() from error
