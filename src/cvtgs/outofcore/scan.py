@@ -69,7 +69,9 @@ def partition_space(
             return -1 - first
         node, half = len(axes), blocks // 2
         part, weights = points[rows], measure[rows]
-        axis = _widest_axis(part, weights)
+        shares = (weights / weights.sum().clamp_min(1e-300))[:, None]
+        variance = (shares * (part - (shares * part).sum(dim=0)).square()).sum(dim=0)
+        axis = int(variance.argmax())
         threshold = _weighted_quantile(part[:, axis], weights, half / blocks)
         axes.append(axis)
         thresholds.append(threshold)
@@ -85,12 +87,6 @@ def partition_space(
         thresholds=torch.tensor(thresholds, dtype=torch.float64),
         children=torch.tensor(children, dtype=torch.int64).reshape(-1, 2),
     )
-
-
-def _widest_axis(points: Tensor, weights: Tensor) -> int:
-    shares = (weights / weights.sum().clamp_min(1e-300))[:, None]
-    variance = (shares * (points - (shares * points).sum(dim=0)).square()).sum(dim=0)
-    return int(variance.argmax())
 
 
 def _weighted_quantile(coordinates: Tensor, weights: Tensor, share: float) -> float:

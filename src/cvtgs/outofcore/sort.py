@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs import analysis, cvt, filters, validity
@@ -170,8 +169,9 @@ def sort_range(job: Job, rows: range) -> SortedCounts:
         valid = validity.valid_rows(scene)
         protected = valid & inside(job.boxes, scene.means)
         if bool(protected.any()):
-            kept = _kept_rows(records, scene, protected)
-            attempt.append(job.path("kept", rows.start).name, kept)
+            kept, some = records[protected.numpy()], scene.select(protected)
+            kept["opacity"] = validity.with_finite_opacities(some).logit_opacities.numpy()
+            attempt.append(job.path("kept", rows.start).name, kept.tobytes())
         free = (valid & ~protected).nonzero()[:, 0]
         chosen, areas, visibility = _filtered(scan, config, scene, free)
         if len(chosen) < len(free):
@@ -213,14 +213,6 @@ def _filtered(
         masses = areas * opacities * analysis.perspective_falloff(distances)
         stays &= ~(far & (masses <= scan.max_flyaway_mass))
     return rows[stays], apparent[stays], visibility[stays]
-
-
-def _kept_rows(records: NDArray[Any], scene: GaussianScene, protected: Tensor) -> bytes:
-    """Return the protected rows, with finite opacities."""
-    kept = records[protected.numpy()]
-    logits = validity.with_finite_opacities(scene.select(protected)).logit_opacities
-    kept["opacity"] = logits.numpy()
-    return bytes(kept.tobytes())
 
 
 def _adopt(job: Job, files: Sequence[SortedFile]) -> None:

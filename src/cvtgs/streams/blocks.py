@@ -110,7 +110,10 @@ class StreamJob(Job):
         """Return whether a part is written, and all its files are complete."""
         try:
             part = self.read_part(block)
-            size = sum(_bytes_of(self.output / name, self.form.kind) for name in part.names)
+            paths = [self.output / name for name in part.names]
+            if self.form.kind == "sog":  # each is a folder of files
+                paths = [file for path in paths for file in path.parent.iterdir()]
+            size = sum(path.stat().st_size for path in paths)
             has_far = all((self.output / name).exists() for name in part.environments.values())
         except (OSError, ValueError):
             return False
@@ -129,13 +132,6 @@ class StreamJob(Job):
         except (OSError, ValueError, KeyError, TypeError):
             return False
         return self.has_sorted_rows()
-
-
-def _bytes_of(path: Path, kind: str) -> int:
-    """Return the bytes of a file that an index names; for a SOG, those of its folder."""
-    if kind == "sog":
-        return sum(file.stat().st_size for file in path.parent.iterdir())
-    return path.stat().st_size
 
 
 @on_host()
@@ -204,7 +200,6 @@ def stream_file(  # noqa: PLR0913 (options by name)
     check_path(source)
     check_path(folder)
     check_environment(environment_radii)
-    _check_axes(axes)
     form = _format(kind, axes=axes, environment_radii=environment_radii, transform=transform)
     simplifier, workers = simplifier or Simplifier(device="cpu"), workers or map
     check_config(simplifier.config, with_images=False)
@@ -251,15 +246,6 @@ def stream_file(  # noqa: PLR0913 (options by name)
     return StreamReport(join_levels(parts), chunks, len(parts), resumed)
 
 
-def _check_axes(axes: tuple[str, str]) -> None:
-    if not isinstance(axes, tuple | list) or len(axes) != 2:
-        raise InvalidArgumentError(
-            f"axes must be those of the input file and those of the output, found {shown(axes)}."
-        )
-    for name in axes:
-        checked_axes(name)
-
-
 def _format(
     kind: str,
     *,
@@ -268,6 +254,12 @@ def _format(
     transform: tuple[float, ...] | None,
 ) -> StreamFormat:
     """Return the format of a stream; refuse options that it does not have."""
+    if not isinstance(axes, tuple | list) or len(axes) != 2:
+        raise InvalidArgumentError(
+            f"axes must be those of the input file and those of the output, found {shown(axes)}."
+        )
+    for name in axes:
+        checked_axes(name)
     if kind != "3dtiles":
         if transform is not None:
             raise InvalidArgumentError("only 3D Tiles have a transform, found one for a SOG.")
