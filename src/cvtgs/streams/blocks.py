@@ -9,16 +9,20 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.analysis import drop_unused_bands
+from cvtgs.analysis.analyze import apparent_areas, visibility_at
 from cvtgs.analysis.effects import restore_comments, select_columns
 from cvtgs.checks import checked
 from cvtgs.clock import StageClock
 from cvtgs.counts import checked_whole, shared_out, target_count, written_ratios
 from cvtgs.devices import HOST, on_host, one_thread, without_autocast
 from cvtgs.errors import InvalidArgumentError, check_path
-from cvtgs.grouping import finer_count
+from cvtgs.filters import filter_rows
+from cvtgs.grouping import allocate, finer_count, order_rows, tessellate_rows, weigh_rows
 from cvtgs.io import change_axes
 from cvtgs.io.atomic import make_folder
 from cvtgs.io.axes import SCENE_AXES, checked_axes
@@ -29,8 +33,9 @@ from cvtgs.mergenet import Checkpoint
 from cvtgs.outofcore import Workers
 from cvtgs.outofcore.job import Job, in_folder, started
 from cvtgs.outofcore.memory import check_memory, chosen_blocks, memory_to_plan, sample_rows
-from cvtgs.outofcore.rows import analysis_of, read_rows
+from cvtgs.outofcore.rows import BlockRows, analysis_of, read_rows
 from cvtgs.outofcore.run import check_config, rows_per_range
+from cvtgs.outofcore.scan import read_sample
 from cvtgs.outofcore.sort import sort_into_blocks
 from cvtgs.pipeline import level_facts, reduce_scene
 from cvtgs.processes import with_progress
@@ -46,11 +51,15 @@ from cvtgs.streams.files import (
     publish,
 )
 from cvtgs.streams.plan import CHUNK_GAUSSIANS, check_environment, near_rows, plan_part
-from cvtgs.streams.shares import block_shares
 from cvtgs.streams.sog import SogFormat
 from cvtgs.streams.tiles import TilesFormat, check_no_environment, check_transform
 from cvtgs.text import counted, shown
 from cvtgs.validity import warn_of_dropped
+
+SAMPLED = 1 << 15  # size of the sample that gives shares; fewer than twice as many rows are read
+
+PRIOR_CELLS = 4.0  # added to the cells found and expected in a block, so that few mean little
+POWER = 0.75  # of the factors on weights; below 1, since cells of blocks end at their borders
 
 
 class StreamReport(NamedTuple):
@@ -284,7 +293,7 @@ def _run(
                 found = sort_into_blocks(job, workers, clock, keep_all=True)
                 with clock.stage("allocate"):
                     ratios = [count / sum(found.rows) for count in job.level_counts]
-                    shares = block_shares(job, ratios, found.cells, sh_degree=job.sh_degree)
+                    shares = _shares(job, ratios, found.cells)
             _write_targets(job, found.rows, shares)
     make_folder(job.output)
     blocks = [block for block, counts in enumerate(job.block_counts()) if counts[0]]
@@ -292,6 +301,44 @@ def _run(
     with clock.stage("blocks", len(unfinished)) as advance:
         list(with_progress(workers(partial(write_block, job), unfinished), advance))
     return [job.read_part(block) for block in blocks], len(blocks) - len(unfinished)
+
+
+def _shares(job: StreamJob, ratios: Sequence[float], weights: Sequence[float]) -> list[list[float]]:
+    """Estimate the share of each block in the cells of levels with these ratios, in any unit.
+
+    A sample is grouped as a scene in one piece, so blocks where merging costs more have more cells.
+    """
+    sample = read_sample(job.source, SAMPLED)
+    if job.blocks == 1 or len(sample) == 0:
+        return [list(weights) for _ in ratios]
+    config = job.config
+    sample = select_columns(sample, config.effects)
+    if job.sh_degree is not None:
+        sample = sample.with_sh_degree(job.sh_degree)
+    scan = job.read_scan()
+    visibility = visibility_at(scan.visibility, sample.means, scan.frame)
+    distances = scan.frame.distances(sample.means)
+    areas = apparent_areas(sample.areas, distances, visibility, config=config.cvt)
+    analysis = analysis_of(scan, BlockRows(sample, areas, visibility))
+    sample = drop_unused_bands(sample, scan.plan)
+    blocks = scan.partition.blocks_of(scan.frame.contract(sample.means))
+    ordered, known = order_rows(sample, analysis, config), torch.tensor(weights).double()
+    found = list[list[float]]()
+    for ratio in ratios:
+        target = max(1, round(ratio * len(sample)))
+        if target >= len(sample):
+            found.append(list(weights))
+            continue
+        rows = filter_rows(sample, analysis, target, config.filter).rows
+        points = weigh_rows(sample, rows, analysis, config, ordered=ordered)
+        tessellation = tessellate_rows(points, analysis, target, config)
+        labels = allocate(points, tessellation, analysis, target, config.allocation)
+        parts = 1.0 / torch.bincount(labels, minlength=target).double()[labels]
+        counts = torch.bincount(blocks[points.rows], parts, minlength=job.blocks)
+        expected = known / known.sum().clamp_min(1e-300) * target
+        factors = (counts + PRIOR_CELLS) / (expected + PRIOR_CELLS)
+        found.append((known * factors**POWER).tolist())
+    return found
 
 
 def _write_targets(job: StreamJob, rows: Sequence[int], shares: Sequence[Sequence[float]]) -> None:

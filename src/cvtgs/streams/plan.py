@@ -265,27 +265,22 @@ def _cut(
     means: Float[Tensor, "c 3"], weights: Int[Tensor, "c"], near: Int[Tensor, "k"], *, most: int
 ) -> tuple[_Cut, list[Int[Tensor, "k"]]]:
     """Split the near Gaussians of the coarsest level until no part replaces more than ``most``."""
-    parts = []
+    parts, ends = [], torch.tensor(_SPREAD, dtype=means.dtype)
 
     def part(rows: Int[Tensor, "k"]) -> _Cut:
         if int(weights[rows].sum()) <= most or len(rows) == 1:
             parts.append(rows)
             return len(parts) - 1
-        order = rows[torch.sort(_widest(means[rows]), stable=True).indices]
+        points = means[rows]
+        low, high = points[:: 1 + len(points) // _SAMPLE].quantile(ends, dim=0)
+        widest = points[:, int((high - low).argmax())]
+        order = rows[torch.sort(widest, stable=True).indices]
         passed = weights[order].cumsum(0)
         half = int(torch.searchsorted(passed, int(passed[-1]) // 2))
         half = min(max(half, 1), len(rows) - 1)
         return part(order[:half]), part(order[half:])
 
     return part(near), parts
-
-
-def _widest(points: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
-    """Return the coordinate with the largest spread, without outliers."""
-    some = points[:: 1 + len(points) // _SAMPLE]
-    ends = torch.tensor(_SPREAD, dtype=points.dtype)
-    low, high = some.quantile(ends, dim=0)
-    return points[:, int((high - low).argmax())]
 
 
 def _rows(labels: Int[Tensor, "m"], scene: GaussianScene, count: int) -> list[Int[Tensor, "k"]]:
