@@ -1,6 +1,7 @@
 """Out-of-core runs: exact counts, the same bits in any order of work, seams, unusual files."""
 
 import json
+from collections import Counter
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -100,8 +101,8 @@ def test_the_lightest_flyaways_are_left_out_up_to_their_share_of_the_mass(share,
         depths=torch.zeros(0, dtype=torch.int64),
         masses=(1e9,),
         falloff_masses=(60.0, 40.0),
-        far_masses=torch.tensor([4.0, 50.0, 1.0, 2.0]).double(),
-        invalid_rows={},
+        far_masses=(torch.tensor([4.0, 50.0, 1.0, 2.0]).double(),),
+        invalid_rows=Counter(),
         valid_count=9,
         kept_count=0,
     )

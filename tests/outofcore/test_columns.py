@@ -1,6 +1,7 @@
 """SH degrees, axes and the row counts of the report are the same in blocks as in one piece."""
 
 import warnings
+from collections import Counter
 
 import pytest
 import torch
@@ -152,8 +153,8 @@ def test_a_hundredth_of_all_gaussians_are_no_flyaways(count: int, most: float) -
         depths=torch.zeros(0, dtype=torch.int64),
         masses=(1.0,),
         falloff_masses=(1.0,),
-        far_masses=torch.full((count,), 2**-20).double(),
-        invalid_rows={},
+        far_masses=(torch.full((count,), 2**-20).double(),),
+        invalid_rows=Counter(),
         valid_count=1000,
         kept_count=0,
     )

@@ -114,8 +114,8 @@ class RangeTotals(NamedTuple):
     depths: Int[Tensor, "voxels"]  # optical depths (:func:`cvtgs.analysis.analyze.add_depths`)
     masses: tuple[float, ...]  # opacity times mean projected area, squared scene units
     falloff_masses: tuple[float, ...]  # the same times the perspective falloff
-    far_masses: Float[Tensor, "f"]  # the same of each Gaussian beyond the distance of flyaways
-    invalid_rows: dict[str, int]  # by the attribute that is NaN, infinite or zero
+    far_masses: tuple[Float[Tensor, "f"], ...]  # the same of each beyond the distance of flyaways
+    invalid_rows: Counter[str]  # by the attribute that is NaN, infinite or zero
     valid_count: int
     kept_count: int  # valid rows in boxes
 
@@ -197,8 +197,8 @@ def scan_range(
         depths,
         tuple(all_masses),
         tuple(falloff_masses),
-        torch.cat(far_masses),
-        dict(found),
+        tuple(far_masses),
+        found,
         valid_count,
         kept_count,
     )
@@ -208,18 +208,10 @@ def add_totals(parts: Iterable[RangeTotals]) -> RangeTotals:
     """Add up the totals of all ranges; the grid of the first is changed in place."""
     rest = iter(parts)  # one after the other: a grid has dozens of megabytes
     total = next(rest)
-    far_masses = [total.far_masses]
     for part in rest:
-        far_masses.append(part.far_masses)
-        total = total._replace(
-            depths=total.depths.add_(part.depths),
-            masses=total.masses + part.masses,
-            falloff_masses=total.falloff_masses + part.falloff_masses,
-            invalid_rows=dict(Counter(total.invalid_rows) + Counter(part.invalid_rows)),
-            valid_count=total.valid_count + part.valid_count,
-            kept_count=total.kept_count + part.kept_count,
-        )
-    return total._replace(far_masses=torch.cat(far_masses))
+        depths, *own = total
+        total = RangeTotals(depths.add_(part.depths), *map(add, own, part[1:]))
+    return total
 
 
 def scan_scene(
@@ -304,7 +296,7 @@ def _view_components(
 
 def _max_flyaway_mass(totals: RangeTotals, max_share: float) -> float:
     """Return the largest mass of a flyaway that is left out; -1 if none is left out."""
-    ascending = torch.sort(totals.far_masses).values
+    ascending = torch.sort(torch.cat(totals.far_masses)).values
     max_share *= len(ascending) <= filters.most_flyaways(totals.valid_count)
     left_out = ascending[ascending.cumsum(0) <= max_share * totals.falloff_mass]
     return float(left_out[-1]) if max_share > 0 and len(left_out) else -1.0
