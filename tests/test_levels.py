@@ -166,12 +166,24 @@ def test_wrong_arguments_are_refused_before_files_are_written(scene, simplifier,
             [0.01, 0.02, 0.03],
             "must be of one scene, found scenes of 1,000 and 3,000 Gaussians",
         ),
-        (levels, [0.01], r"rhos must hold one ratio per level, 2; found 1\."),
-        (levels, [0.01, 0.01], r"rhos must differ, since they name the files, found 0\.01 twice"),
+        (
+            levels,
+            [0.01],
+            r"in their order, .*; found \[0\.01\] for \[30, 60\] of 3,000 Gaussians\.",
+        ),
+        (
+            [levels[0]] * 2,
+            [0.01, 0.01],
+            r"and differ, .*; found \[0\.01, 0\.01\] for \[30, 30\] of",
+        ),
         (levels, [0.01, -3], r"rho must be above 0 and at most 1; found -3\."),
         (levels, [0.01, math.nan], r"rho must be above 0 and at most 1; found nan\."),
         (levels, [0.01, "a"], r"rho must be a number above 0 and at most 1; found 'a'\."),
-        (levels, [0.02, 0.01], r"in their order; found 0\.02 for 30 of 3,000 Gaussians\."),
+        (
+            levels,
+            [0.02, 0.01],
+            r"in their order, .*; found \[0\.02, 0\.01\] for \[30, 60\] of 3,000",
+        ),
         (levels, 0.01, r"ratios must be a list of numbers, found 0\.01\."),
     ):
         with pytest.raises(InvalidArgumentError, match=message):

@@ -157,23 +157,13 @@ def write_levels(
     check_path(folder)
     checked_axes(SCENE_AXES if axes is None else axes)
     ratios = written_ratios(rhos)
-    if len(ratios) != len(levels):
+    total, counts = levels[0].report.input_count, [level.report.target_count for level in levels]
+    if [target_count(total, rho) for rho in ratios] != counts or len({*ratios}) < len(ratios):
         raise InvalidArgumentError(
-            f"rhos must hold one ratio per level, {len(levels)}; found {len(ratios)}."
+            f"rhos must be the ratios of the levels, in their order, and differ, since they name "
+            f"the files; found {ratios} for {counts} of {counted(total, 'Gaussian')}."
         )
     place, names = Path(folder), level_names(ratios, suffix)
-    twice = [rho for rho in ratios if ratios.count(rho) > 1]
-    if twice:
-        raise InvalidArgumentError(
-            f"rhos must differ, since they name the files, found {twice[0]} twice."
-        )
-    for level, rho in zip(levels, ratios, strict=True):
-        made = level.report
-        if target_count(made.input_count, rho) != made.target_count:
-            raise InvalidArgumentError(
-                f"rhos must be the ratios of the levels, in their order; found {rho} for "
-                f"{made.target_count:,} of {counted(made.input_count, 'Gaussian')}."
-            )
     check_levels(place, names, overwrite=overwrite)
     if overwrite:  # the old index would describe other files until the new one is written
         with suppress(OSError):  # then it cannot be replaced either
@@ -184,7 +174,7 @@ def write_levels(
         entries.append(_entry(level, rho, place / name))
     index = LevelsIndex(
         source=printable_name(Path(source).name),
-        source_count=levels[0].report.input_count,
+        source_count=total,
         levels=tuple(sorted(entries, key=lambda entry: -entry.count)),
     )
     write_atomically(place / INDEX_NAME, index.to_json().encode(), overwrite=overwrite)
