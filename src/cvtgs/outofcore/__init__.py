@@ -4,10 +4,4 @@ from cvtgs.outofcore.distributed import ClusterWorkers, connect
 from cvtgs.outofcore.run import simplify_file
 from cvtgs.processes import LocalWorkers, Workers
 
-__all__ = [
-    "ClusterWorkers",
-    "LocalWorkers",
-    "Workers",
-    "connect",
-    "simplify_file",
-]
+__all__ = ["ClusterWorkers", "LocalWorkers", "Workers", "connect", "simplify_file"]

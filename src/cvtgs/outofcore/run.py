@@ -107,8 +107,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         cameras: Cameras for presets that render the scene; None takes those beside the source if
             it has the axes of PLY files (:func:`cvtgs.views.find_own_cameras`), or else generates
             views.
-        workers: Call functions for ranges of the file and for blocks; None calls them one after
-            the other in this process.
+        workers: Call functions for parts of the file and for blocks; None calls them here.
         range_rows: Rows of the file that one process reads in one call; None for 260,000, or a
             64th of the file if that is more.
         overwrite: Whether an existing output may be replaced.
@@ -119,8 +118,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
 
     Raises:
         ConfigError: The configuration cannot be used with blocks.
-        InvalidArgumentError: Ratio, count or boxes cannot be met, or an argument is out of range or
-            of another type.
+        InvalidArgumentError: Ratio, count or boxes cannot be met, or a number is out of range.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
         OutputExistsError: The output exists and may not be replaced.
@@ -196,7 +194,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
             with clock.stage("assemble"):
                 assemble_blocks(job, output, axes=output_axes, overwrite=overwrite)
                 is_complete = True
-            return report_blocks(job, simplifier, clock, energies=energies, resumed=resumed)
+            checkpoint = "none" if simplifier.checkpoint is None else simplifier.checkpoint.name
+            return report_blocks(job, checkpoint, clock, energies=energies, resumed=resumed)
         finally:
             if is_complete:  # also if the listener raises at the last event
                 job.remove()
@@ -235,10 +234,7 @@ def _scan_and_sort(job: Job, workers: Workers, clock: StageClock) -> Manifest:
     else:
         cells = shared_out(finer, found.cells, rooms=found.rows)
     return Manifest(
-        grouped=total,
-        total=found.rest,
-        cells=tuple(cells),
-        left_out_mass=found.left_out_mass,
+        grouped=total, total=found.rest, cells=tuple(cells), left_out_mass=found.left_out_mass
     )
 
 
@@ -321,12 +317,7 @@ def _kept_scenes(job: Job) -> Iterator[GaussianScene]:
 
 
 def report_blocks(
-    job: Job,
-    simplifier: Simplifier,
-    clock: StageClock,
-    *,
-    energies: tuple[float, ...],
-    resumed: int,
+    job: Job, checkpoint: str, clock: StageClock, *, energies: tuple[float, ...], resumed: int
 ) -> SimplifyReport:
     """Add up the reports of all blocks."""
     scan, with_cells = job.read_scan(), job.blocks_with_cells()
@@ -347,7 +338,7 @@ def report_blocks(
     tessellated = job.blocks_with_rows() if job.goes_by_steps else []
     parts = [job.read("parts", block) for block in tessellated]
     kept_mass = sum(float(job.source.scene(rows).masses.sum()) for rows in kept_rows(job))
-    renders = simplifier.config.uses_renders or bool(refinements)
+    renders = job.config.uses_renders or bool(refinements)
     return SimplifyReport(
         input_count=total,
         output_count=min(job.target, valid),
@@ -369,7 +360,7 @@ def report_blocks(
         energy=sum(report.energy for report in reports)
         + sum(float(part["energy"]) for part in parts),
         backend=reports[0].backend if reports else "none",
-        checkpoint="none" if simplifier.checkpoint is None else simplifier.checkpoint.name,
+        checkpoint=checkpoint,
         plan=scan.plan,
         views=origin_of_views(job.cameras) if renders else "none",
         stages=tuple(clock.costs),
@@ -377,5 +368,5 @@ def report_blocks(
         refinement=join_refinements(refinements) if refinements else None,
         blocks=job.blocks,
         resumed_blocks=resumed,
-        config=simplifier.config,
+        config=job.config,
     )

@@ -44,8 +44,7 @@ _SAMPLE = 1 << 16  # points used for these quantiles
 class StreamedLevel(Protocol):
     """What a stream needs of a level, such as :class:`cvtgs.report.Level`.
 
-    If it has ``error_sums``, too, as that class describes them, tiles state errors of their own,
-    else that of the level.
+    With its ``error_sums``, too, tiles state errors of their own, else that of the level.
     """
 
     @property
