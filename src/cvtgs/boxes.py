@@ -98,10 +98,6 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
     Args:
         path: A file that holds ``{"min": [x, y, z], "max": [x, y, z]}``, or a list of these.
 
-    Raises:
-        InputError: The file cannot be read.
-        InvalidArgumentError: The file holds something else.
-
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -137,10 +133,6 @@ def inside(
     regions: Sequence[Box | Sphere] | Box | Sphere, means: Float[Tensor, "n 3"]
 ) -> Bool[Tensor, "n"]:
     """Return a mask of the centres that lie in any of some boxes and spheres.
-
-    Args:
-        regions: The boxes and spheres, or a single one.
-        means: Positions, scene units.
 
     Example:
         >>> box = Box(min=(0, 0, 0), max=(1, 1, 1))

@@ -87,10 +87,6 @@ def _cos_sin(degrees: float) -> tuple[float, float]:
 def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -> GaussianScene:
     """Keep the Gaussians whose centres lie in any region; centres with NaN lie in none.
 
-    Args:
-        scene: The scene; it is not changed.
-        regions: A box or sphere, or several.
-
     Returns:
         The kept Gaussians, in their order, bit for bit; the same object if all are kept.
 
@@ -108,11 +104,7 @@ def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -
 
 @checked
 def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
-    """Drop the Gaussians below an opacity; invalid ones stay.
-
-    Args:
-        scene: The scene; it is not changed.
-        least: Smallest opacity to keep, 0 to 1.
+    """Drop the Gaussians below an opacity, 0 to 1; invalid ones stay.
 
     Returns:
         The others, in their order, bit for bit; the same object if none is dropped.
@@ -133,11 +125,7 @@ def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
 
 @checked
 def drop_large(scene: GaussianScene, largest: float) -> GaussianScene:
-    """Drop the Gaussians above a size; invalid ones stay.
-
-    Args:
-        scene: The scene; it is not changed.
-        largest: Largest standard deviation to keep, scene units, above 0.
+    """Drop the Gaussians above a size, a standard deviation in scene units; invalid ones stay.
 
     Returns:
         The others, in their order, bit for bit; the same object if none is dropped.
@@ -163,10 +151,6 @@ def _kept(scene: GaussianScene, keep: Tensor) -> GaussianScene:
 @checked
 def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
     """Rotate, scale and translate a scene; view-dependent colours and normals rotate with it.
-
-    Args:
-        scene: The scene; it is not changed.
-        motion: The transform.
 
     Returns:
         The moved scene. Only tensors that change are computed: a translation changes the centres

@@ -73,8 +73,6 @@ class SceneViewer:
         """Simplify the scene to a ratio in (0, 1], and add the result to the scenes.
 
         Raises:
-            InvalidArgumentError: The ratio is out of range.
-            ConfigError: The preset does not exist.
             RunError: The viewer was stopped.
         """
         if preset not in self._prepared:
