@@ -53,7 +53,7 @@ OWNERS = {
     "gsplat": "rendering/gsplat_backend.py",
     "PIL": ("evaluation/comparison_files.py", "evaluation/images.py", "io/sog/container.py"),
     "jinja2": "evaluation/comparison_files.py",
-    "zstandard": ("io/spz/read.py", "io/spz/write.py"),
+    "zstandard": "io/spz.py",
     "safetensors": "io/tensors.py",
     "matplotlib": "plots.py",
     "distributed": "outofcore/distributed.py",

@@ -14,8 +14,7 @@ from cvtgs import GaussianScene, load, save
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
 from cvtgs.io import change_axes, losses
 from cvtgs.io.atomic import atomic_output
-from cvtgs.io.spz import write_spz
-from cvtgs.io.spz.write import Version
+from cvtgs.io.spz import Version, write_spz
 from format_cases import (
     DATA,
     assert_as_oracle,

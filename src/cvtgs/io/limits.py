@@ -221,8 +221,8 @@ def _ranges(scene: GaussianScene, limits: FormatLimits) -> dict[str, tuple[float
     """Return the minimum and maximum of each limited tensor in a file of the scene."""
     ranges = dict(limits.ranges)
     if limits.fixed_point:
-        from cvtgs.io.spz.write import largest_coordinate  # noqa: PLC0415 (only where written)
+        from cvtgs.io.spz import fractional_bits  # noqa: PLC0415 (only where written)
 
-        largest = largest_coordinate(scene)
+        largest = SPZ_STEPS / (1 << fractional_bits(scene))
         ranges["means"] = (-largest, largest)
     return ranges

@@ -44,8 +44,7 @@ from cvtgs.io.gltf.document import (
     coefficients,
     open_gltf,
 )
-from cvtgs.io.spz import decode_spz
-from cvtgs.io.spz.read import peek_spz
+from cvtgs.io.spz import decode_spz, peek_spz
 from cvtgs.math.parameters import matrices_to_quats, quats_to_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
