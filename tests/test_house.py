@@ -51,7 +51,7 @@ OWNERS = {
     "kornia": "losses.py",
     "numba": "rendering/compiled.py",
     "gsplat": "rendering/gsplat_backend.py",
-    "PIL": ("evaluation/comparison_files.py", "evaluation/images.py", "io/sog/container.py"),
+    "PIL": ("evaluation/comparison_files.py", "evaluation/images.py", "io/sog/"),
     "jinja2": "evaluation/comparison_files.py",
     "zstandard": "io/spz.py",
     "safetensors": "io/tensors.py",

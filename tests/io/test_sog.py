@@ -16,8 +16,7 @@ from hypothesis import given, settings, strategies as st
 
 from cvtgs import load, save
 from cvtgs.errors import FileFormatError, InputNotFoundError
-from cvtgs.io.sog.container import encode_webp
-from cvtgs.io.sog.write import codebook, palette, palette_size, write_sog
+from cvtgs.io.sog.write import codebook, encode_webp, palette, palette_size, write_sog
 from format_cases import (
     DATA,
     assert_as_oracle,
@@ -248,7 +247,7 @@ DAMAGED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "count": (lambda m: m.update(count=0), "a SOG must hold 1 to 268,402,689 Gaussians, found 0."),
     "lying count": (
         lambda m: m.update(count=200_000),
-        "must have a pixel for each of 200,000 Gaussians, found",
+        "must have 200,000 pixels, found",
     ),
     "shape": (
         lambda m: (m.update(version=1), m["means"].update(shape=["many", 3])),
@@ -316,7 +315,7 @@ def test_a_file_that_is_no_zip_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError) as caught:
         load(path)
     assert str(caught.value) == (
-        f"{path}: a .sog file must be a zip of meta.json and images, found no zip: file is not a "
+        f"{path}: a .sog must be a zip of meta.json and images, found no zip: file is not a "
         f"zip file."
     )
 

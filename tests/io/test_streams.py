@@ -187,7 +187,7 @@ def test_tensors_of_any_memory_layout_are_written(tmp_path: Path, end: str) -> N
         (b"", FileFormatError, "the first bytes must be those of a .ply, .spz, .sog, .glb or .pt"),
         (b"what?", FileFormatError, "found b'what'; give format= for other formats"),
         (b"ply\nnonsense", FileFormatError, "the BytesIO: the PLY header must end"),
-        (b"PK\x03\x04nonsense", FileFormatError, "the BytesIO: a .sog file must be a zip"),
+        (b"PK\x03\x04nonsense", FileFormatError, "the BytesIO: a .sog must be a zip"),
     ],
 )
 def test_damaged_streams_are_refused(content: bytes, error: type[Exception], text: str) -> None:

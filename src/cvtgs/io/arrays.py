@@ -1,5 +1,6 @@
 """Scenes as numpy arrays, and the conversions of parameters that compact formats share."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,6 @@ from cvtgs.math import parameters
 from cvtgs.math.frames import morton_order
 from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
 from cvtgs.scene import GaussianScene
-from cvtgs.tags import ANTIALIASED
 from cvtgs.validity import writable_rows
 
 Floats = NDArray[np.float32]
@@ -61,7 +61,7 @@ def arrays_of(scene: GaussianScene, *, sh_degree: int = 3) -> Arrays:
     )
 
 
-def scene_of(arrays: Arrays, *, antialiased: bool = False) -> GaussianScene:
+def scene_of(arrays: Arrays, *, comments: Sequence[str] = ()) -> GaussianScene:
     """Build a scene."""
 
     def tensor(values: Floats) -> Tensor:
@@ -74,7 +74,7 @@ def scene_of(arrays: Arrays, *, antialiased: bool = False) -> GaussianScene:
         logit_opacities=tensor(arrays.logit_opacities),
         sh0=tensor(arrays.sh0)[:, None, :],
         shN=tensor(arrays.shN),
-        comments=(ANTIALIASED.text,) if antialiased else (),
+        comments=tuple(comments),
     )
 
 

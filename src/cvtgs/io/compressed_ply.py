@@ -1,7 +1,6 @@
 """PlayCanvas' compressed PLY files: 16 bytes per Gaussian and one per view-dependent SH value."""
 
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -69,8 +68,7 @@ def read_compressed_ply(path: Path) -> GaussianScene:
         The scene, with the comments of the file.
 
     Raises:
-        InputNotFoundError: The file does not exist.
-        InputError: It cannot be opened or read.
+        InputError: The file does not exist, or cannot be opened or read.
         FileFormatError: It is not a compressed PLY file, or damaged.
     """
     with open_input(path) as file:
@@ -78,7 +76,7 @@ def read_compressed_ply(path: Path) -> GaussianScene:
         _check(header, path)
         tables = _read_tables(file, header, path)
     with np.errstate(all="ignore"):  # damaged ranges give non-finite numbers
-        return replace(scene_of(_unpacked(tables)), comments=header.comments)
+        return scene_of(_unpacked(tables), comments=header.comments)
 
 
 def _unpacked(tables: dict[str, Rows]) -> Arrays:

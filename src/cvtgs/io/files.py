@@ -237,6 +237,9 @@ Text = Annotated[str, Strict(), Field(description="a string")]
 Flag = Annotated[bool, Strict(), Field(description="true or false")]
 Items = Annotated[list[Any], Field(description="a list")]
 Vector = Annotated[tuple[Number, Number, Number], Field(description="3 finite numbers")]
+FourNumbers = Annotated[
+    tuple[Number, Number, Number, Number], Field(description="4 finite numbers")
+]
 AnyDocument = TypeVar("AnyDocument", bound=Document)
 
 

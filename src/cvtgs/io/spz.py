@@ -31,6 +31,7 @@ from cvtgs.io.files import check_expansion, open_input
 from cvtgs.io.limits import SPZ_STEPS
 from cvtgs.math.spherical_harmonics import REST_COUNTS, degree_of
 from cvtgs.scene import GaussianScene
+from cvtgs.tags import ANTIALIASED
 from cvtgs.validity import writable_rows
 
 __all__ = ["decode_spz", "read_spz", "write_spz"]
@@ -133,7 +134,7 @@ def decode_spz(
         sh0=(colors - np.float32(0.5)) / _COLOR_SCALE,
         shN=(rest.astype(np.float32) - 128) / 128,
     )
-    scene = scene_of(arrays, antialiased=bool(header.flags & _ANTIALIASED))
+    scene = scene_of(arrays, comments=[ANTIALIASED.text] if header.flags & _ANTIALIASED else ())
     return change_axes(scene, axes or stated or SCENE_AXES, SCENE_AXES)
 
 

@@ -1,45 +1,52 @@
-"""Read a SOG, version 1 or 2: its ``meta.json`` and the values in its images."""
+"""Read a SOG, version 1 or 2: ``meta.json`` and the values in images, in a zip or a folder."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+import io
+import os
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from pydantic import AfterValidator, Field
 
-from cvtgs.errors import FileFormatError
+from cvtgs.errors import FileFormatError, is_out_of_memory
 from cvtgs.io.arrays import HALF_RANGE, Arrays, logits_of_bytes, restore_largest, scene_of
 from cvtgs.io.files import (
+    LONGEST_NAME,
     Document,
+    FourNumbers,
     Number,
     Text,
     Vector,
     Whole,
     check_expansion,
+    is_file,
+    is_within,
+    open_input,
     parse_json,
     validated,
 )
-from cvtgs.io.sog.container import (
-    META,
-    MOST_META_BYTES,
-    PALETTE_COLUMNS,
-    QUAT_TAG,
-    Reader,
-    decode_webp,
-    is_index,
-    open_container,
-    stored_bytes,
-)
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
-from cvtgs.tags import TWO_SCALES
+from cvtgs.tags import ANTIALIASED, TWO_SCALES
+from cvtgs.text import shown
 
+META = "meta.json"
+QUAT_TAG = 252  # the last byte of a rotation is this plus the number of its omitted component
+PALETTE_COLUMNS = 64  # entries of the SH palette per row of its image
+
+_MOST_META_BYTES = 1 << 20  # real ones have about ten thousand bytes
+_PNG = b"\x89PNG\r\n\x1a\n"
 _MOST_COUNT = 16383**2  # pixels of the largest WebP image
-
 _LABELS = 1 << 16
 _SPARE_PIXELS = 1 << 16
+
+_Reader = Callable[[str, int], bytes]  # of a file by its name, with the most bytes it may have
 
 
 class _OneImage(Document):
@@ -109,8 +116,8 @@ class _ThreeRanges(_OneImage):
 
 
 class _FourRanges(_OneImage):
-    mins: tuple[Number, Number, Number, Number] = Field(description="4 finite numbers")
-    maxs: tuple[Number, Number, Number, Number] = Field(description="4 finite numbers")
+    mins: FourNumbers
+    maxs: FourNumbers
 
 
 class _PaletteRange(_TwoImages):
@@ -147,50 +154,46 @@ def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
         path: The ``.sog`` file, or the ``meta.json`` that lies beside its images.
         trust_sizes: Whether the images may unpack to any size.
 
-    Returns:
-        The scene.
-
     Raises:
-        InputNotFoundError: The file does not exist, or an image is missing.
-        InputError: A file cannot be opened or read.
+        InputError: A file is missing, or cannot be opened or read.
         FileFormatError: It is not a SOG, or damaged.
     """
+    is_index = path.suffix.lower() == ".json"
+    where = str(path) if is_index else f"{path}: {META}"
     # A damaged file may hold numbers beyond float32.
-    with open_container(path) as read, np.errstate(all="ignore"):
-        where = str(path) if is_index(path) else f"{path}: {META}"
-        meta = _read_meta(parse_json(read(META, MOST_META_BYTES), where), where)
+    with _opened(path, is_index=is_index) as read, np.errstate(all="ignore"):
+        meta = _read_meta(parse_json(read(META, _MOST_META_BYTES), where), where)
         document = meta.document
         if not trust_sizes:
-            _check_expansion(meta, path)
+            _check_expansion(meta, path, is_index=is_index)
         images = _Images(read=read, count=meta.count, path=path)
         means = _means(images, document.means)
         quats = _quats(images.rows(document.quats.files[0]))
         log_scales = _decoded(meta.scales, images.rows(document.scales.files[0]))
         colors = images.rows(document.sh0.files[0])
-        opacities = colors[:, 3]
         arrays = Arrays(
             means=means,
             quats=quats,
             log_scales=log_scales,
-            logit_opacities=logits_of_bytes(opacities)
+            logit_opacities=logits_of_bytes(colors[:, 3])
             if meta.opacities is None
-            else meta.opacities.astype(np.float32)[opacities],
+            else meta.opacities.astype(np.float32)[colors[:, 3]],
             sh0=_decoded(meta.colors, colors),
             shN=_rest(images, meta),
         )
-    antialiased = document.model == "antialiased" or document.antialias is True
-    scene = scene_of(arrays, antialiased=antialiased)
-    if document.model == "2dgs":
-        return replace(scene, comments=(*scene.comments, TWO_SCALES.text))
-    return scene
+    is_smooth = document.model == "antialiased" or document.antialias is True
+    comments = [ANTIALIASED.text] if is_smooth else []
+    comments += [TWO_SCALES.text] if document.model == "2dgs" else []
+    return scene_of(arrays, comments=comments)
 
 
-def _check_expansion(meta: _Meta, path: Path) -> None:
+def _check_expansion(meta: _Meta, path: Path, *, is_index: bool) -> None:
     document, rest = meta.document, meta.document.shN
     parts = (document.means, document.scales, document.quats, document.sh0, rest)
     names = {name for part in parts if part is not None for name in part.files}
     degree = 0 if rest is None else rest.bands if isinstance(rest, _Palette) else 3
-    stored = stored_bytes(path, sorted(names))
+    files = [path.parent / name for name in names] if is_index else [path]
+    stored = sum(file.stat().st_size for file in files if is_file(file))
     check_expansion(path, count=meta.count, sh_degree=degree, stored=stored)
 
 
@@ -245,22 +248,24 @@ def _meta_of_version_2(content: Any, where: str) -> _Meta:
 class _Images:
     """The images of a SOG; none may have many more pixels than there are Gaussians."""
 
-    read: Reader
+    read: _Reader
     count: int
     path: Path
 
     def pixels(self, name: str, most: int) -> UInt8[np.ndarray, "h w 4"]:
-        """Decode an image."""
+        if PurePosixPath(name).name != name or not is_within(name) or len(name) > LONGEST_NAME:
+            raise FileFormatError(
+                f"{self.path}: the files of a SOG must have names of at most {LONGEST_NAME} "
+                f"characters without folders, found {shown(name)}."
+            )
         content = self.read(name, 5 * most + _SPARE_PIXELS)
         return decode_webp(content, f"{self.path}: {name}", most_pixels=most)
 
     def rows(self, name: str) -> UInt8[np.ndarray, "n 4"]:
-        """Return the pixel of every Gaussian."""
         pixels = self.pixels(name, 4 * self.count + _SPARE_PIXELS).reshape(-1, 4)
         if len(pixels) < self.count:
             raise FileFormatError(
-                f"{self.path}: {name} must have a pixel for each of {self.count:,} Gaussians, "
-                f"found {len(pixels):,}."
+                f"{self.path}: {name} must have {self.count:,} pixels, found {len(pixels):,}."
             )
         return pixels[: self.count]
 
@@ -313,3 +318,80 @@ def _rest(images: _Images, meta: _Meta) -> Float[np.ndarray, "n k 3"]:
     rest: Float[np.ndarray, "n k 3"] = entries[np.where(known, numbers, 0)]
     rest[~known] = 0
     return rest
+
+
+@contextmanager
+def _opened(path: Path, *, is_index: bool) -> Iterator[_Reader]:
+    """Open the zip of a bundled SOG; the files of another lie beside its index."""
+    if is_index:
+        yield partial(_read_beside, path)
+        return
+    with open_input(path) as file:
+        with _damage_named(f"{path}: a .sog must be a zip of meta.json and images, found no zip"):
+            archive = zipfile.ZipFile(file)
+        with archive:
+            yield partial(_read_inside, archive, path)
+
+
+def _read_beside(path: Path, name: str, most: int) -> bytes:
+    part = path if name == META else path.with_name(name)
+    with open_input(part) as file:
+        _check_length(os.fstat(file.fileno()).st_size, most, str(part))
+        return file.read()
+
+
+def _read_inside(archive: zipfile.ZipFile, path: Path, name: str, most: int) -> bytes:
+    where = f"{path}: {name}"
+    with _damage_named(f"{where} must be intact, found damage"):
+        if name not in archive.namelist():
+            raise FileFormatError(f"{path}: must contain {name}, found none.")
+        entry = archive.getinfo(name)
+        # of other methods, zipfile unpacks blocks whole
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise FileFormatError(
+                f"{where} must be stored or deflated in the zip, found method "
+                f"{entry.compress_type}; zip the images again."
+            )
+        _check_length(entry.file_size, most, where)
+        with archive.open(entry) as member:
+            return member.read(most)
+
+
+def _check_length(found: int, most: int, where: str) -> None:
+    if found > most:
+        raise FileFormatError(f"{where} must have at most {most:,} bytes, found {found:,}.")
+
+
+@contextmanager
+def _damage_named(text: str) -> Iterator[None]:
+    """Convert any error of zipfile or Pillow, which pass on those of their parts and codecs."""
+    try:
+        yield
+    except FileFormatError:
+        raise
+    except Exception as error:
+        if is_out_of_memory(error):
+            raise
+        reason = shown(str(error).lower().rstrip(".") or type(error).__name__)[1:-1]
+        raise FileFormatError(f"{text}: {reason}.") from error
+
+
+def decode_webp(content: bytes, where: str, *, most_pixels: int) -> UInt8[np.ndarray, "h w 4"]:
+    """Decode an image that stores numbers in its channels."""
+    from PIL.PngImagePlugin import PngImageFile  # noqa: PLC0415 (loads in its time)
+    from PIL.WebPImagePlugin import WebPImageFile  # noqa: PLC0415
+
+    is_webp = content.startswith(b"RIFF") and content[8:12] == b"WEBP"
+    if not is_webp and not content.startswith(_PNG):
+        raise FileFormatError(f"{where} must be a WebP image, found something else.")
+    kind = WebPImageFile if is_webp else PngImageFile  # `Image.open` would warn of large images
+    with (
+        _damage_named(f"{where} must be an intact image, found"),
+        kind(io.BytesIO(content)) as image,
+    ):
+        if image.width * image.height > most_pixels:
+            raise FileFormatError(
+                f"{where} must have at most {most_pixels:,} pixels, "
+                f"found {image.width} x {image.height}."
+            )
+        return np.asarray(image.convert("RGBA"))

@@ -24,8 +24,7 @@ from cvtgs.io.files import (
     scene_size,
     validated,
 )
-from cvtgs.io.sog.container import META
-from cvtgs.io.sog.read import read_sog
+from cvtgs.io.sog.read import META, read_sog
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
 
@@ -63,8 +62,7 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
         The Gaussians of the level, file by file, and those of the environment.
 
     Raises:
-        InputNotFoundError: A file is missing.
-        InputError: A file cannot be opened or read.
+        InputError: A file is missing, or cannot be opened or read.
         FileFormatError: It is not a streamed SOG, damaged, or names files outside its folder.
         InvalidArgumentError: The level does not exist.
     """

@@ -1,5 +1,6 @@
 """Write a SOG: its codebooks, its SH palette and its images."""
 
+import io
 import json
 import zipfile
 from collections.abc import Iterator
@@ -22,7 +23,7 @@ from cvtgs.io.arrays import (
     opacity_bytes,
     to_bytes,
 )
-from cvtgs.io.sog.container import META, PALETTE_COLUMNS, QUAT_TAG, encode_webp
+from cvtgs.io.sog.read import META, PALETTE_COLUMNS, QUAT_TAG
 from cvtgs.math.spherical_harmonics import degree_of
 from cvtgs.scene import GaussianScene
 
@@ -177,6 +178,15 @@ def _image(
     if opacities is not None:
         pixels[:count, 3] = opacities
     return pixels.reshape(height, width, 4)
+
+
+def encode_webp(numbers: UInt8[np.ndarray, "h w 4"]) -> bytes:
+    """Write numbers to a lossless image, including those of pixels with opacity 0."""
+    from PIL import Image  # noqa: PLC0415
+
+    file = io.BytesIO()
+    Image.fromarray(numbers).save(file, format="webp", lossless=True, exact=True, quality=80)
+    return file.getvalue()
 
 
 class Codebook(NamedTuple):
