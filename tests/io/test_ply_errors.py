@@ -167,12 +167,13 @@ VERTEX_CASES: Mapping[str, tuple[bytes, str]] = {
     ),
     "odd f_rest": (
         with_rest(*range(10)),
-        "'vertex' must have 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3), found 10.",
+        "'vertex' must have 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3) numbered from 0, "
+        "found 10.",
     ),
     "f_rest gap": (
         with_rest(0, 1, 2, 4, 5, 6, 7, 8, 9),
-        "the 9 f_rest properties of 'vertex' must be numbered from 0 without gaps, "
-        "found no f_rest_3.",
+        "'vertex' must have 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3) numbered from 0, "
+        "found 9, no f_rest_3.",
     ),
     "compressed": (
         ply_bytes(

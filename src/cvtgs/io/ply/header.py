@@ -1,7 +1,4 @@
-"""The header of a PLY file, and the vertex properties of Gaussians that it lists.
-
-The only mapping from PLY names to tensors of a scene is here.
-"""
+"""The header of a PLY file, and the only mapping from PLY names to tensors of a scene."""
 
 import re
 from collections import Counter
@@ -37,10 +34,8 @@ _REST_NAME = re.compile(r"f_rest_(0|[1-9][0-9]*)")
 class ScalarType(NamedTuple):
     """A PLY number type."""
 
-    code: str
-    """The numpy type, without byte order."""
-    dtype: torch.dtype
-    """The torch dtype that holds every value and that every torch operation supports."""
+    code: str  # of numpy, without byte order
+    dtype: torch.dtype  # holds every value, and every operation of torch supports it
 
 
 SCALARS: Mapping[str, ScalarType] = {
@@ -53,17 +48,11 @@ SCALARS: Mapping[str, ScalarType] = {
     "float": ScalarType("f4", torch.float32),
     "double": ScalarType("f8", torch.float64),
 }
-"""PLY number types by their canonical names."""
-
-TYPE_NAMES: Mapping[str, str] = {
-    alias: name
-    for name, kind in SCALARS.items()
-    for alias in (name, np.dtype(kind.code).name)  # such as uchar and uint8
+_TYPE_NAMES: Mapping[str, str] = {  # canonical names by all names, such as uchar and uint8
+    alias: name for name, kind in SCALARS.items() for alias in (name, np.dtype(kind.code).name)
 }
-"""Canonical names of PLY number types, by all their names."""
-
 FLOAT_TYPES = ("float", "double")
-_LENGTH_NAMES = [name for name, kind in TYPE_NAMES.items() if kind not in FLOAT_TYPES]
+_LENGTH_NAMES = [name for name, kind in _TYPE_NAMES.items() if kind not in FLOAT_TYPES]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,10 +60,8 @@ class Property:
     """One property line."""
 
     name: str
-    type: str
-    """Canonical name of the number type (of the items, for a list)."""
-    count_type: str | None = None
-    """Number type of the length of a list; None for a plain number."""
+    type: str  # canonical name of the number type (of the items, for a list)
+    count_type: str | None = None  # of the length of a list; None for a plain number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,15 +97,11 @@ class Header:
     encoding: Encoding
     elements: tuple[Element, ...]
     comments: tuple[str, ...]
-    data_offset: int
-    """Where the first row starts, in bytes."""
+    data_offset: int  # where the first row starts, in bytes
 
 
 def read_header(file: BinaryIO, path: str) -> Header:
-    """Parse the header of a PLY file.
-
-    Lines may end in LF, CRLF or CR and have trailing blanks; blank lines are skipped.
-    """
+    """Parse a header; lines may end in LF, CRLF or CR and have trailing blanks, or be blank."""
     lines, data_offset = _header_lines(file.read(MAX_HEADER_BYTES), path)
     encoding: Encoding | None = None
     tables: list[tuple[str, int, list[Property]]] = []
@@ -134,13 +117,13 @@ def read_header(file: BinaryIO, path: str) -> Header:
             case ["element", name, count] if _COUNT.fullmatch(count) and is_name(name):
                 tables.append((name, int(count), []))
             case ["property", "list", length, kind, name] if (
-                tables and length in _LENGTH_NAMES and kind in TYPE_NAMES and is_name(name)
+                tables and length in _LENGTH_NAMES and kind in _TYPE_NAMES and is_name(name)
             ):
                 tables[-1][2].append(
-                    Property(name=name, type=TYPE_NAMES[kind], count_type=TYPE_NAMES[length])
+                    Property(name=name, type=_TYPE_NAMES[kind], count_type=_TYPE_NAMES[length])
                 )
-            case ["property", kind, name] if tables and kind in TYPE_NAMES and is_name(name):
-                tables[-1][2].append(Property(name=name, type=TYPE_NAMES[kind]))
+            case ["property", kind, name] if tables and kind in _TYPE_NAMES and is_name(name):
+                tables[-1][2].append(Property(name=name, type=_TYPE_NAMES[kind]))
             case _:
                 raise FileFormatError(
                     f"{path}: line {number} of the PLY header must be a valid format, element, "
@@ -278,10 +261,9 @@ def rest_index(name: str) -> int | None:
     return int(match[1]) if match else None
 
 
-def rest_count_of(names: Iterable[str]) -> int | None:
+def rest_count_of(names: Iterable[str]) -> int:
     """Count the view-dependent SH coefficients per channel."""
-    total = sum(rest_index(name) is not None for name in names)
-    return total // 3 if total in {3 * count for count in REST_COUNTS} else None
+    return sum(rest_index(name) is not None for name in names) // 3
 
 
 def dtype_of(layout: Layout) -> torch.dtype:
@@ -299,7 +281,6 @@ def find_vertices(header: Header, path: str) -> Element:
         found += ", ..." if len(header.elements) > 5 else ""
         raise FileFormatError(f"{path}: must have an element 'vertex', found {found}.")
     _check_properties(vertex, path)
-    _check_rest(vertex, path)
     if vertex.count == 0:
         raise FileFormatError(f"{path}: must hold at least one Gaussian, found 'element vertex 0'.")
     return vertex
@@ -323,11 +304,7 @@ def check_size(header: Header, table: Element, *, path: str, size: int) -> None:
 
 
 def layout_of(vertex: Element) -> Layout:
-    """Return the layout that a scene keeps and will be written with.
-
-    Lists are left out. Standard properties that the file stores as integers become floats of the
-    precision of the scene, since merged values are not whole numbers.
-    """
+    """Return the layout that a scene is written with: no lists, and no whole standard values."""
     float_type = "double" if dtype_of(vertex.columns) == torch.float64 else "float"
     return tuple(
         (name, float_type if is_standard(name) and kind not in FLOAT_TYPES else kind)
@@ -352,19 +329,10 @@ def _check_properties(vertex: Element, path: str) -> None:
             f"{path}: a 3DGS scene must have the 'vertex' properties x, y, z, f_dc_0..2, opacity, "
             f"scale_0..1 and rot_0..3, found none named {names}{hint}."
         )
-
-
-def _check_rest(vertex: Element, path: str) -> None:
-    names = [prop.name for prop in vertex.properties]
-    numbers = {number for name in names if (number := rest_index(name)) is not None}
-    if rest_count_of(names) is None:
+    numbers = sorted(number for name in scalars if (number := rest_index(name)) is not None)
+    gap = next((i for i, number in enumerate(numbers) if i != number), None)
+    if gap is not None or len(numbers) not in [3 * count for count in REST_COUNTS]:
         raise FileFormatError(
-            f"{path}: 'vertex' must have 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3), "
-            f"found {len(numbers)}."
-        )
-    gaps = sorted(set(range(len(numbers))) - numbers)
-    if gaps:
-        raise FileFormatError(
-            f"{path}: the {len(numbers)} f_rest properties of 'vertex' must be numbered from 0 "
-            f"without gaps, found no f_rest_{gaps[0]}."
+            f"{path}: 'vertex' must have 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3) "
+            f"numbered from 0, found {len(numbers)}{'' if gap is None else f', no f_rest_{gap}'}."
         )

@@ -4,7 +4,7 @@ import io
 import os
 import warnings
 from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -45,20 +45,16 @@ from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import FLAT_LOG_SCALE, NORMALS, GaussianScene
 from cvtgs.text import first_of, shown
 
-CHUNK_BYTES = 1 << 20
-"""Bytes of a file that are mapped at a time; a chunk and its copy fit into the L2 cache."""
-
+CHUNK_BYTES = 1 << 20  # mapped at a time; a chunk and its copy fit into the L2 cache
 _CHUNK_ROWS = 1 << 12  # rows of plyfile that are copied at a time; they fit into a cache
 
 _NOT_ASCII = bytes.maketrans(bytes(range(128, 256)), b"?" * 128)
 
 
 def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -> GaussianScene:
-    """Read a scene from a PLY file of any encoding, property order and number type.
+    """Read a scene from any PLY file; only uncommon layouts are not memory-mapped.
 
-    The common layout (binary little endian, vertices first) is memory-mapped; plyfile reads the
-    others. Both give the same scene, with NaN and infinity. SH bands above ``sh_degree`` are not
-    copied but set to zero.
+    SH bands above ``sh_degree`` are not copied but set to zero.
     """
     where = str(path)
     with open_input(path) as file:
@@ -113,7 +109,7 @@ def assemble(
 ) -> GaussianScene:
     """Copy rows into a new scene, chunk by chunk; memory is the scene plus that of chunks."""
     types = dict(layout)
-    tensors = _empty_tensors(count, rest_count_of(types) or 0, dtype_of(layout))
+    tensors = _empty_tensors(count, rest_count_of(types), dtype_of(layout))
     extras = {
         name: torch.empty(count, dtype=SCALARS[kind].dtype, device="cpu")
         for name, kind in layout
@@ -180,29 +176,25 @@ def can_map(header: Header) -> bool:
     return little and first.name == "vertex" and not first.has_lists
 
 
-def _changed_while_read(path: object, error: Exception) -> InputError:
-    """Return the error for a file whose rows can no longer be mapped."""
-    found = "it shorter" if isinstance(error, ValueError) else reason_of(error)
-    return InputError(f"{path}: must stay as it is while it is read, found {found}.")
-
-
 def _mapped_chunks(file: BinaryIO, header: Header, path: str) -> Iterator[NDArray[Any]]:
-    """Map the vertex rows, a megabyte at a time.
-
-    Each chunk is unmapped when the caller releases it, so the file's pages do not accumulate:
-    memory is one or two chunks.
-    """
+    """Map the vertex rows, a megabyte at a time, which is unmapped once the caller releases it."""
     vertex = header.elements[0]
     dtype = row_dtype(vertex.columns)
     rows = max(1, CHUNK_BYTES // dtype.itemsize)
     for start in range(0, vertex.count, rows):
         offset = header.data_offset + start * dtype.itemsize
-        shape = (min(rows, vertex.count - start),)
-        try:
-            mapped = np.memmap(file, dtype, "r", offset, shape)
-        except (OSError, ValueError) as error:
-            raise _changed_while_read(path, error) from error
-        yield mapped.view(np.ndarray)
+        yield _mapped(file, dtype, offset, min(rows, vertex.count - start), path=path)
+
+
+def _mapped(
+    file: BinaryIO | str, dtype: np.dtype[Any], offset: int, count: int, *, path: str
+) -> NDArray[Any]:
+    """Map rows into memory; pages are read on use."""
+    try:
+        return np.memmap(file, dtype, "r", offset, (count,)).view(np.ndarray)
+    except (OSError, ValueError) as error:
+        found = "it shorter" if isinstance(error, ValueError) else reason_of(error)
+        raise InputError(f"{path}: must stay as it is while it is read, found {found}.") from error
 
 
 def _parsed_rows(file: BinaryIO, header: Header, vertex: Element, path: str) -> NDArray[Any]:
@@ -215,10 +207,13 @@ def _parsed_rows(file: BinaryIO, header: Header, vertex: Element, path: str) -> 
             f"{how_to_install('plyfile')}."
         ) from error
     needed = header.elements[: header.elements.index(vertex) + 1]
+    # Numpy warns of empty lists in text; elsewhere the filters of the process stay as they are.
+    has_text_lists = header.encoding == "ascii" and any(element.has_lists for element in needed)
+    quiet = warnings.catch_warnings(action="ignore") if has_text_lists else nullcontext()
     try:
         with (
             _CleanStream(file, header, needed) as stream,
-            _no_warnings(header, needed),
+            quiet,
             np.errstate(all="ignore"),  # numbers beyond a type become infinite
         ):
             data = PlyData.read(stream)[f"e{len(needed) - 1}"].data
@@ -232,16 +227,6 @@ def _parsed_rows(file: BinaryIO, header: Header, vertex: Element, path: str) -> 
     rows: NDArray[Any] = data.view(np.ndarray)
     rows.dtype.names = tuple(prop.name for prop in vertex.properties)
     return rows
-
-
-def _no_warnings(header: Header, elements: tuple[Element, ...]) -> AbstractContextManager[object]:
-    """Ignore the warnings of numpy about empty lists, which only a text file with lists causes.
-
-    Elsewhere, the filters of warnings, which belong to the whole process, stay as they are.
-    """
-    if header.encoding == "ascii" and any(element.has_lists for element in elements):
-        return warnings.catch_warnings(action="ignore")
-    return nullcontext()
 
 
 def _plain_header(header: Header, elements: tuple[Element, ...]) -> bytes:
@@ -316,23 +301,16 @@ class PlyRows:
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Map a range of rows into memory; pages are read on use."""
         place = self.offset + start * self.dtype.itemsize
-        try:
-            mapped = np.memmap(self.path, self.dtype, "r", place, (stop - start,))
-        except (OSError, ValueError) as error:
-            raise _changed_while_read(self.path, error) from error
-        return mapped.view(np.ndarray)
+        return _mapped(self.path, self.dtype, place, stop - start, path=self.path)
 
     def scene(self, rows: NDArray[Any]) -> GaussianScene:
-        """Build a scene from rows with at least the columns of the file, as a load returns it."""
+        """Build a scene from rows with at least the columns of the file."""
         return self.assemble([rows], len(rows))
 
     def assemble(
         self, parts: Iterable[NDArray[Any]], count: int, *, is_slim: bool = False
     ) -> GaussianScene:
-        """Build a scene from ``count`` rows in several parts, as :func:`cvtgs.load` returns it.
-
-        A slim one lacks extra columns and SH bands above the constant one.
-        """
+        """Build a scene from rows; a slim one has no extras, and of the SH only the constant."""
         degree = 0 if is_slim else self.sh_degree
         scene = assemble(
             parts,
@@ -351,8 +329,7 @@ def open_rows(
 ) -> PlyRows:
     """Open a binary little endian PLY of a 3DGS scene, vertices first, without reading its rows.
 
-    Scenes are converted from ``axes``, by default those of PLY files, and lack the SH bands above
-    ``sh_degree``.
+    Scenes are converted from ``axes``, those of PLY files unless given.
     """
     if sh_degree is not None:
         check_degree(sh_degree)

@@ -49,19 +49,24 @@ def write_ply(scene: GaussianScene, file: BinaryIO) -> None:
         raise InvalidSceneError("a scene must hold at least one Gaussian to be written, found 0.")
     layout = _output_layout(scene)
     file.write(header_bytes(scene.comments, [("vertex", len(scene), layout)]))
-    dtype = row_dtype(layout)
+    dtype, slots = row_dtype(layout), standard_slots(scene.shN.shape[1])
     rows = max(1, CHUNK_BYTES // dtype.itemsize)
     for start in range(0, len(scene), rows):
-        block = np.zeros(min(rows, len(scene) - start), dtype)
-        _fill(block, scene, start)
+        stop = min(start + rows, len(scene))
+        block = np.zeros(stop - start, dtype)  # columns that the scene does not have stay zero
+        tensors = {name: _rows(tensor, start, stop) for name, tensor in scene.tensors().items()}
+        with np.errstate(over="ignore"):
+            for name in (name for name, _ in layout):
+                if name in slots:
+                    tensor, column = slots[name]
+                    block[name] = tensors[tensor][column]
+                elif name in scene.extras:
+                    block[name] = _rows(scene.extras[name], start, stop)
         file.write(block.view(np.uint8).data)
 
 
 def join_plys(paths: Sequence[str | os.PathLike[str]], file: BinaryIO) -> None:
-    """Write the concatenated rows of PLY files that have the same columns.
-
-    The comments are those of the first file. Memory is one buffer.
-    """
+    """Write the rows of PLY files that have the same columns, with the comments of the first."""
     parts = [open_rows(path) for path in paths]
     first, total = parts[0], sum(part.count for part in parts)
     for part in parts:
@@ -72,21 +77,6 @@ def join_plys(paths: Sequence[str | os.PathLike[str]], file: BinaryIO) -> None:
         with Path(part.path).open("rb") as content:
             content.seek(part.offset)
             shutil.copyfileobj(content, file, 1 << 20)
-
-
-def _fill(block: NDArray[Any], scene: GaussianScene, start: int) -> None:
-    """Copy rows of the scene into a block; columns that the scene does not have stay zero."""
-    stop = start + len(block)
-    slots = standard_slots(scene.shN.shape[1])
-    tensors = {name: _rows(tensor, start, stop) for name, tensor in scene.tensors().items()}
-    names = block.dtype.names or ()
-    with np.errstate(over="ignore"):
-        for name in names:
-            if name in slots:
-                tensor, column = slots[name]
-                block[name] = tensors[tensor][column]
-            elif name in scene.extras:
-                block[name] = _rows(scene.extras[name], start, stop)
 
 
 def _rows(tensor: Tensor, start: int, stop: int) -> NDArray[Any]:
@@ -107,11 +97,9 @@ def lost_scales(scene: GaussianScene) -> str:
 
 
 def _output_layout(scene: GaussianScene) -> Layout:
-    """Return the properties to write.
+    """Return the properties to write: those of the source where they fit, or INRIA's.
 
-    A scene that was read keeps names, order and types. Where its layout no longer fits, the
-    standard properties follow the scene (SH degree, dtype), columns that no longer exist are left
-    out, and new extras are appended. A scene without a layout gets INRIA's.
+    Standard ones follow the scene (SH degree, dtype), and new extras are appended.
     """
     _check_names(scene)
     slots = standard_slots(scene.shN.shape[1])
