@@ -20,7 +20,8 @@ import cvtgs
 from cvtgs.cli.main import build_parser, main
 from cvtgs.errors import FileFormatError
 from cvtgs.io.files import FREE_BYTES, MOST_EXPANSION
-from cvtgs.io.gltf.document import SPLATS, SPZ, write_chunks
+from cvtgs.io.gltf.document import SPLATS, SPZ
+from cvtgs.io.gltf.write import write_chunks
 from format_cases import DATA, refusal
 from gltf_cases import parts
 from scenes import random_scene

@@ -233,15 +233,15 @@ def test_damaged_spz_data_inside_a_glb_is_refused(tmp_path: Path) -> None:
     document, binary = parts(path.read_bytes())
     path.write_bytes(joined(document, bytes(4) + binary[4:]))
     assert refusal(path) == (
-        f"{path}: bufferViews[0]: an .spz file must start with the magic number of gzip or SPZ, "
-        f"found b'\\x00\\x00\\x00\\x00'."
+        f"{path}: bufferViews[0]: an .spz file must start with a header of 16 bytes that begin "
+        f"with b'NGSP', found 16 that begin with b'\\x00\\x00\\x00\\x00'."
     )
 
 
 def test_a_scene_that_is_too_large_for_a_glb_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cvtgs.io.gltf.document._MOST_BYTES", 1000)
+    monkeypatch.setattr("cvtgs.io.gltf.write._MOST_BYTES", 1000)
     with pytest.raises(InvalidSceneError, match="must be smaller than 4 GiB, found a scene that"):
         save(storable_scene(9), tmp_path / "a.glb")
     assert list(tmp_path.iterdir()) == []

@@ -1,19 +1,17 @@
 """The parts of a glTF document that splats need: chunks, buffers, accessors and their checks."""
 
 import base64
-import json
 import struct
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from cvtgs.errors import FileFormatError, InvalidSceneError
+from cvtgs.errors import FileFormatError
 from cvtgs.io.files import (
     LONGEST_NAME,
     AnyDocument,
@@ -39,10 +37,9 @@ AXES = "luf"  # axes of every glTF: y up, z forward, hence x left (section 3.4 o
 POSITION, COLOR = "POSITION", "COLOR_0"
 ROTATION, SCALE, OPACITY = f"{SPLATS}:ROTATION", f"{SPLATS}:SCALE", f"{SPLATS}:OPACITY"
 
-_MAGIC, _VERSION = b"glTF", 2
-_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
-_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
-_MOST_BYTES = 1 << 32
+MAGIC, VERSION = b"glTF", 2
+HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
+JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 BYTE, UNSIGNED_BYTE, SHORT, UNSIGNED_SHORT, FLOAT = 5120, 5121, 5122, 5123, 5126
 _COMPONENTS: dict[int, np.dtype[Any]] = {
@@ -53,6 +50,8 @@ _COMPONENTS: dict[int, np.dtype[Any]] = {
     FLOAT: np.dtype("<f4"),
 }
 _LARGEST = {BYTE: 127, UNSIGNED_BYTE: 255, SHORT: 32767, UNSIGNED_SHORT: 65535}
+# Integer encodings of attributes (component type, whether normalized) and the text for errors. All
+# attributes may be floats; those that are not listed must be.
 _INTEGERS = frozenset((kind, scaled) for kind in _LARGEST for scaled in (False, True))
 _ENCODINGS = {
     ROTATION: (
@@ -66,8 +65,6 @@ _ENCODINGS = {
     ),
     POSITION: (_INTEGERS, f"floats, or of bytes or shorts with {QUANTIZATION}"),
 }
-"""Integer encodings of attributes (component type, whether normalized) and the text for errors. All
-attributes may be floats; those that are not listed must be."""
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _MOST_STRIDE = 252
 
@@ -129,10 +126,8 @@ class GltfFile:
 
     path: Path
     root: GltfRoot
-    binary: bytes | None = None
-    """The binary chunk of a ``.glb``."""
-    stored: int
-    """Bytes of the file on disk, plus those read so far from files beside it, each once."""
+    binary: bytes | None = None  # the chunk of a ``.glb``
+    stored: int  # bytes of the file, plus those read so far from files beside it, each once
     _buffers: dict[int, memoryview] = field(default_factory=dict)
     _beside: dict[Path, bytes] = field(default_factory=dict)
 
@@ -193,13 +188,8 @@ class GltfFile:
                 f"{len(content):,} bytes, found {accessor.count:,} elements that end at "
                 f"byte {end:,}"
             )
-        rows: NDArray[Any] = np.ndarray(
-            (accessor.count, WIDTHS[kind]),
-            dtype,
-            content,
-            accessor.byteOffset,
-            (stride, dtype.itemsize),
-        )
+        shape, strides = (accessor.count, WIDTHS[kind]), (stride, dtype.itemsize)
+        rows: NDArray[Any] = np.ndarray(shape, dtype, content, accessor.byteOffset, strides)
         numbers = rows.astype(np.float32)
         if accessor.normalized and component in _LARGEST:
             numbers /= np.float32(_LARGEST[component])
@@ -216,7 +206,13 @@ class GltfFile:
             if content is None:
                 raise self.error(f"buffers[{index}] must have a uri, found none")
         elif buffer.uri.startswith("data:"):
-            content = self._decoded(buffer.uri, index)
+            head, _, text = buffer.uri.partition(",")
+            if not head.endswith(";base64"):
+                raise self.error(f"buffers[{index}] must have data in base64, found {shown(head)}")
+            try:
+                content = base64.b64decode(text, validate=True)
+            except ValueError as error:  # also binascii.Error
+                raise self.error(f"buffers[{index}] must be base64, found: {error}") from error
         else:
             content = self._read_beside(buffer.uri, index)
         if len(content) < buffer.byteLength:
@@ -225,15 +221,6 @@ class GltfFile:
             )
         self._buffers[index] = memoryview(content)[: buffer.byteLength]
         return self._buffers[index]
-
-    def _decoded(self, uri: str, index: int) -> bytes:
-        head, _, text = uri.partition(",")
-        if not head.endswith(";base64"):
-            raise self.error(f"buffers[{index}] must have data in base64, found {shown(head)}")
-        try:
-            return base64.b64decode(text, validate=True)
-        except ValueError as error:  # also binascii.Error
-            raise self.error(f"buffers[{index}] must be valid base64, found: {error}") from error
 
     def _read_beside(self, uri: str, index: int) -> bytes:
         """Read a file once, however many buffers it is."""
@@ -256,7 +243,7 @@ def open_gltf(path: Path) -> GltfFile:
     with open_input(path) as file:
         content = file.read()
     binary, text = None, content
-    if content[: len(_MAGIC)] == _MAGIC:
+    if content[: len(MAGIC)] == MAGIC:
         text, binary = _chunks(content, path)
     elif path.suffix.lower() == ".glb":
         raise FileFormatError(f"{path}: a .glb must start with b'glTF', found {content[:4]!r}.")
@@ -266,21 +253,20 @@ def open_gltf(path: Path) -> GltfFile:
 
 def _chunks(content: bytes, path: Path) -> tuple[bytes, bytes | None]:
     """Split a ``.glb`` into its JSON chunk and its binary chunk."""
-    if len(content) < _HEADER.size:
+    if len(content) < HEADER.size:
+        text = f"{path}: must start with a header of 12 bytes, found {len(content)}."
+        raise FileFormatError(text)
+    _, version, length = HEADER.unpack_from(content)
+    if version != VERSION or length > len(content):
         raise FileFormatError(
-            f"{path}: must start with a header of {_HEADER.size} bytes, found {len(content)}."
-        )
-    _, version, length = _HEADER.unpack_from(content)
-    if version != _VERSION or length > len(content):
-        raise FileFormatError(
-            f"{path}: must be glTF version {_VERSION} with the {length:,} bytes that its "
+            f"{path}: must be glTF version {VERSION} with the {length:,} bytes that its "
             f"header promises, found version {version} and {len(content):,} bytes."
         )
     found: dict[int, bytes] = {}
-    at = _HEADER.size
-    while at + _CHUNK.size <= length:
-        size, kind = _CHUNK.unpack_from(content, at)
-        at += _CHUNK.size
+    at = HEADER.size
+    while at + CHUNK.size <= length:
+        size, kind = CHUNK.unpack_from(content, at)
+        at += CHUNK.size
         if at + size > length:
             raise FileFormatError(
                 f"{path}: a chunk must end within the {length:,} bytes of the file, found one that "
@@ -288,32 +274,6 @@ def _chunks(content: bytes, path: Path) -> tuple[bytes, bytes | None]:
             )
         found.setdefault(kind, content[at : at + size])
         at += size
-    if _JSON_CHUNK not in found:
+    if JSON_CHUNK not in found:
         raise FileFormatError(f"{path}: a .glb must have a JSON chunk, found none.")
-    return found[_JSON_CHUNK], found.get(_BINARY_CHUNK)
-
-
-def json_bytes(document: dict[str, Any]) -> bytes:
-    """Return a document as JSON without blanks."""
-    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-
-
-def write_chunks(
-    file: BinaryIO, document: dict[str, Any], size: int, parts: Iterable[bytes]
-) -> None:
-    """Write a ``.glb`` with one buffer, given its size in bytes and its parts."""
-    text = json_bytes({**document, "buffers": [{"byteLength": size}]})
-    text += b" " * (-len(text) % 4)
-    padded = size + -size % 4
-    length = _HEADER.size + 2 * _CHUNK.size + len(text) + padded
-    if length >= _MOST_BYTES:
-        raise InvalidSceneError(
-            f"a .glb must be smaller than 4 GiB, found a scene that takes {length:,} bytes; write "
-            f".spz.glb, or simplify it."
-        )
-    file.write(_HEADER.pack(_MAGIC, _VERSION, length))
-    file.write(_CHUNK.pack(len(text), _JSON_CHUNK) + text)
-    file.write(_CHUNK.pack(padded, _BINARY_CHUNK))
-    for part in parts:
-        file.write(part)
-    file.write(bytes(padded - size))
+    return found[JSON_CHUNK], found.get(BINARY_CHUNK)

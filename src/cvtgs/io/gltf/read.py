@@ -17,6 +17,7 @@ from cvtgs.io.arrays import Arrays, log_scales_of, logits_of, scene_of, unit_qua
 from cvtgs.io.axes import SCENE_AXES, change_axes
 from cvtgs.io.files import (
     Document,
+    FourNumbers,
     Items,
     Number,
     Size,
@@ -52,10 +53,8 @@ from cvtgs.tags import ANTIALIASED
 from cvtgs.text import counted, printable, shown
 
 _KNOWN = (SPLATS, SPZ, QUANTIZATION)
-_POINTS = 0
-MOST_PLACED, NODE_BYTES = 1000, 40
-"""A file may show this many primitives, and one more for so many bytes, fewer than a node takes."""
-
+# A file may show this many primitives, and one more for so many bytes, fewer than a node takes.
+_MOST_PLACED, _NODE_BYTES = 1000, 40
 _EVENNESS = 1e-4  # tolerance for the scale of a node to count as uniform, relative to it
 
 Matrix = Float[np.ndarray, "4 4"]
@@ -72,9 +71,7 @@ class _Node(Document):
         None, description="16 finite numbers"
     )
     translation: Vector = (0, 0, 0)
-    rotation: tuple[Number, Number, Number, Number] = Field(
-        (0, 0, 0, 1), description="4 finite numbers"
-    )
+    rotation: FourNumbers = (0, 0, 0, 1)
     scale: Vector = (1, 1, 1)
 
 
@@ -103,11 +100,11 @@ class _Compression(Document):
 
 
 class _Splats(NamedTuple):
-    """A primitive of splats with its extension and its place in errors."""
+    """A primitive of splats with its extension."""
 
     primitive: _Primitive
     splatting: _Splatting
-    where: str
+    where: str  # its place in errors
 
 
 def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False) -> GaussianScene:
@@ -118,7 +115,7 @@ def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False)
         raise file.error(
             f"must require no extensions other than {', '.join(_KNOWN)}, found {shown(strange[0])}"
         )
-    placed = _splats(file, math.inf if trust_sizes else file.stored // NODE_BYTES + MOST_PLACED)
+    placed = _splats(file, math.inf if trust_sizes else file.stored // _NODE_BYTES + _MOST_PLACED)
     if not placed:
         raise file.error(f"must have a mesh primitive with {SPLATS}, found none")
     splats = {one.where: one for one, _ in placed}  # each once, though nodes may repeat its mesh
@@ -199,22 +196,19 @@ def _check_sizes(file: GltfFile, splats: dict[str, _Splats], placed: list[str]) 
     """Refuse nodes that repeat the same bytes too often."""
     counts, degrees = dict[str, int](), []
     for where, one in splats.items():
-        counts[where], degree = _size(file, one)
-        degrees.append(degree)
+        packed = _packed(file, one)
+        if packed is not None:
+            header = peek_spz(*packed)
+            counts[where] = header.count
+            degrees.append(header.sh_degree)
+            continue
+        position = file.entry(Accessor, "accessors", _index(file, one, POSITION))
+        if position.bufferView is not None:
+            file.view(position.bufferView)  # so that the bytes of a file beside it count
+        counts[where] = position.count
+        degrees.append(_degree(file, one))
     count = sum(counts[where] for where in placed)
     check_expansion(file.path, count=count, sh_degree=max(degrees), stored=file.stored)
-
-
-def _size(file: GltfFile, one: _Splats) -> tuple[int, int]:
-    """Return the number of Gaussians of a primitive, and their SH degree."""
-    packed = _packed(file, one)
-    if packed is not None:
-        header = peek_spz(*packed)
-        return header.count, header.sh_degree
-    position = file.entry(Accessor, "accessors", _index(file, one, POSITION))
-    if position.bufferView is not None:
-        file.view(position.bufferView)  # so that the bytes of a file beside it count
-    return position.count, _degree(file, one)
 
 
 def _packed(file: GltfFile, one: _Splats) -> tuple[bytes, str] | None:
@@ -229,23 +223,27 @@ def _packed(file: GltfFile, one: _Splats) -> tuple[bytes, str] | None:
 
 def _read_primitive(file: GltfFile, one: _Splats, *, trust_sizes: bool) -> GaussianScene:
     primitive, splatting = one.primitive, one.splatting
-    if primitive.mode != _POINTS or splatting.kernel != KERNEL:
+    if primitive.mode != 0 or splatting.kernel != KERNEL:
         raise file.error(
             f"Gaussians must be points (mode 0) with the kernel {KERNEL!r}, found mode "
             f"{primitive.mode} and {shown(splatting.kernel)}"
         )
     if splatting.colorSpace != COLOR_SPACE:
-        warn(
-            f"{file.path}: read colours of the colour space {shown(splatting.colorSpace)} as "
-            f"{COLOR_SPACE!r}.",
-            DroppedDataWarning,
-        )
+        found = f"{file.path}: read colours of the colour space {shown(splatting.colorSpace)}"
+        warn(f"{found} as {COLOR_SPACE!r}.", DroppedDataWarning)
     packed = _packed(file, one)
     if packed is None:
         scene = _read_attributes(file, one)
     else:
         scene = decode_spz(*packed, axes=SCENE_AXES, trust_sizes=trust_sizes)
-    return _with_comments(scene, primitive.extras)
+    lines = primitive.extras.get("comments") if isinstance(primitive.extras, dict) else None
+    comments = [
+        printable(line)
+        for line in (lines if isinstance(lines, list) else ())
+        if isinstance(line, str) and "\n" not in line
+    ]
+    own = () if ANTIALIASED.is_in(comments) else scene.comments
+    return replace(scene, comments=(*own, *comments))
 
 
 def _read_attributes(file: GltfFile, one: _Splats) -> GaussianScene:
@@ -307,17 +305,6 @@ def _degree(file: GltfFile, one: _Splats) -> int:
             )
         degree = band
     return degree
-
-
-def _with_comments(scene: GaussianScene, extras: Any) -> GaussianScene:
-    lines = extras.get("comments") if isinstance(extras, dict) else None
-    comments = [
-        printable(line)
-        for line in (lines if isinstance(lines, list) else ())
-        if isinstance(line, str) and "\n" not in line
-    ]
-    own = () if ANTIALIASED.is_in(comments) else scene.comments
-    return replace(scene, comments=(*own, *comments))
 
 
 def _moved(file: GltfFile, scene: GaussianScene, matrix: Matrix) -> GaussianScene:

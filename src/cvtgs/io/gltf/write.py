@@ -2,13 +2,15 @@
 
 import base64
 import io
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, BinaryIO, Final
 
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from cvtgs.errors import InvalidSceneError
 from cvtgs.io.arrays import (
     Arrays,
     Bytes,
@@ -20,10 +22,15 @@ from cvtgs.io.arrays import (
     to_bytes,
 )
 from cvtgs.io.gltf.document import (
+    BINARY_CHUNK,
+    CHUNK,
     COLOR,
     COLOR_SPACE,
     FLOAT,
+    HEADER,
+    JSON_CHUNK,
     KERNEL,
+    MAGIC,
     OPACITY,
     POSITION,
     ROTATION,
@@ -31,16 +38,16 @@ from cvtgs.io.gltf.document import (
     SPLATS,
     SPZ,
     UNSIGNED_BYTE,
+    VERSION,
     WIDTHS,
     coefficients,
-    json_bytes,
-    write_chunks,
 )
 from cvtgs.io.spz import write_spz
 from cvtgs.math.spherical_harmonics import degree_of
 from cvtgs.scene import GaussianScene
 
 _CHUNK_ROWS = 1 << 18
+_MOST_BYTES = 1 << 32
 _ARRAY_BUFFER = 34962
 _DATA = "data:application/octet-stream;base64,"
 _SPZ_VERSION: Final = 3  # the newest version that readers of the draft of the extension accept
@@ -185,3 +192,29 @@ def _document(
         "accessors": accessors,
         "bufferViews": views,
     }
+
+
+def json_bytes(document: dict[str, Any]) -> bytes:
+    """Return a document as JSON without blanks."""
+    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+
+
+def write_chunks(
+    file: BinaryIO, document: dict[str, Any], size: int, parts: Iterable[bytes]
+) -> None:
+    """Write a ``.glb`` with one buffer, given its size in bytes and its parts."""
+    text = json_bytes({**document, "buffers": [{"byteLength": size}]})
+    text += b" " * (-len(text) % 4)
+    padded = size + -size % 4
+    length = HEADER.size + 2 * CHUNK.size + len(text) + padded
+    if length >= _MOST_BYTES:
+        raise InvalidSceneError(
+            f"a .glb must be smaller than 4 GiB, found a scene that takes {length:,} bytes; write "
+            f".spz.glb, or simplify it."
+        )
+    file.write(HEADER.pack(MAGIC, VERSION, length))
+    file.write(CHUNK.pack(len(text), JSON_CHUNK) + text)
+    file.write(CHUNK.pack(padded, BINARY_CHUNK))
+    for part in parts:
+        file.write(part)
+    file.write(bytes(padded - size))
