@@ -48,7 +48,8 @@ CAMERAS_TXT: Mapping[str, tuple[str, str]] = {
     ),
     "size": (
         "1 PINHOLE 64 99999999 9 9 9 9",
-        "the image size must be from 1 to 1,048,576 pixels, found 64 x 99999999.",
+        "an image must have 1 to 1,048,576 pixels per side and at most 268,435,456 in all, "
+        "found 64 x 99999999.",
     ),
 }
 
@@ -147,8 +148,8 @@ BINARY: Mapping[str, tuple[str, bytes, str]] = {
     ),
     "width": (
         "cameras", packed_cameras(width=1 << 63),
-        "camera 0: the image size must be from 1 to 1,048,576 pixels, "
-        "found 9223372036854775808 x 48.",
+        "camera 0: an image must have 1 to 1,048,576 pixels per side and at most 268,435,456 in "
+        "all, found 9223372036854775808 x 48.",
     ),
     "lying count of images": (
         "images", packed_image(count=9),
@@ -161,7 +162,7 @@ BINARY: Mapping[str, tuple[str, bytes, str]] = {
     ),
     "endless name": (
         "images", packed_image(name=b"x" * 5000),
-        "the name of image 0 must end within 4,096 bytes, found no end.",
+        "the name of image 0 must end within 4,096 bytes, found none.",
     ),
     "no name": (
         "images", packed_image(name=b"\0"), "image 0: the image must have a name, found none.",

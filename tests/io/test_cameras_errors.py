@@ -80,7 +80,8 @@ TRANSFORMS: Mapping[str, tuple[Callable[[Any], None], str]] = {
     "half a pixel": (put("w", value=64.5), " 'w' must be a whole number, found 64.5."),
     "no pixel": (
         put("frames", 3, "w", value=0),
-        " frame 3: the image size must be from 1 to 1,048,576 pixels, found 0 x 48.",
+        " frame 3: an image must have 1 to 1,048,576 pixels per side and at most 268,435,456 in "
+        "all, found 0 x 48.",
     ),
     "half a turn": (
         lambda document: (
@@ -91,7 +92,8 @@ TRANSFORMS: Mapping[str, tuple[Callable[[Any], None], str]] = {
     ),
     "pixels": (
         lambda document: document["frames"][3].update(w=20_000, h=20_000),
-        " frame 3: an image must have at most 268,435,456 pixels, found 20000 x 20000.",
+        " frame 3: an image must have 1 to 1,048,576 pixels per side and at most 268,435,456 in "
+        "all, found 20000 x 20000.",
     ),
     "focal length below 0": (
         put("frames", 3, "fl_x", value=-5),

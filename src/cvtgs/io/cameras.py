@@ -29,10 +29,6 @@ _SKEW = 0.01
 _TEST_EVERY = 8
 
 _COLMAP_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
-_KNOWN_FILES = (
-    "transforms.json, transforms_train.json, transforms_test.json, a COLMAP model (in sparse/0, "
-    "sparse or the folder itself) or cameras.json"
-)
 
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
@@ -48,8 +44,7 @@ class Lens:
     cy: float
     width: int
     height: int
-    distorted: bool = False
-    """Whether the file has a distortion, which is left out."""
+    distorted: bool = False  # whether the file has a distortion, which is left out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,22 +52,17 @@ class View:
     """The camera of one photograph; its name is the name or path in the file."""
 
     name: str
-    viewmat: Float[np.ndarray, "4 4"]
-    """From world to camera, OpenCV axes."""
+    viewmat: Float[np.ndarray, "4 4"]  # from world to camera, OpenCV axes
     lens: Lens
 
 
 def checked_lens(lens: Lens, where: str) -> Lens:
     """Return the lens, after checking that its intrinsics are possible."""
-    if not (1 <= lens.width <= MAX_PIXELS and 1 <= lens.height <= MAX_PIXELS):
+    sides = (lens.width, lens.height)
+    if min(sides) < 1 or max(sides) > MAX_PIXELS or lens.width * lens.height > MAX_AREA:
         raise FileFormatError(
-            f"{where}: the image size must be from 1 to {MAX_PIXELS:,} pixels, "
-            f"found {lens.width} x {lens.height}."
-        )
-    if lens.width * lens.height > MAX_AREA:
-        raise FileFormatError(
-            f"{where}: an image must have at most {MAX_AREA:,} pixels, "
-            f"found {lens.width} x {lens.height}."
+            f"{where}: an image must have 1 to {MAX_PIXELS:,} pixels per side and at most "
+            f"{MAX_AREA:,} in all, found {lens.width} x {lens.height}."
         )
     numbers = (lens.fx, lens.fy, lens.cx, lens.cy)
     if not all(np.isfinite(numbers)) or min(lens.fx, lens.fy) <= 0:
@@ -128,20 +118,17 @@ def to_cameras(views: Sequence[View], path: str) -> Cameras:
             f"since rendering uses pinhole cameras; compare with undistorted photographs.",
             DroppedDataWarning,
         )
-    viewmats = np.stack([view.viewmat for view in views])
-    intrinsics = np.stack([_intrinsics(view.lens, width=width, height=height) for view in views])
+    intrinsics = []
+    for lens in (view.lens for view in views):
+        x, y = width / lens.width, height / lens.height
+        intrinsics.append([[lens.fx * x, 0, lens.cx * x], [0, lens.fy * y, lens.cy * y], [0, 0, 1]])
     return Cameras(
-        viewmats=torch.from_numpy(viewmats),
-        Ks=torch.from_numpy(intrinsics),
+        viewmats=torch.from_numpy(np.stack([view.viewmat for view in views])),
+        Ks=torch.from_numpy(np.array(intrinsics, np.float64)),
         width=width,
         height=height,
         names=tuple(view.name for view in views),
     )
-
-
-def _intrinsics(lens: Lens, *, width: int, height: int) -> Float[np.ndarray, "3 3"]:
-    x, y = width / lens.width, height / lens.height
-    return np.array([[lens.fx * x, 0, lens.cx * x], [0, lens.fy * y, lens.cy * y], [0, 0, 1]])
 
 
 def load_cameras(path: str | os.PathLike[str], *, split: Split | None = None) -> Cameras:
@@ -178,8 +165,7 @@ def load_cameras(path: str | os.PathLike[str], *, split: Split | None = None) ->
     Raises:
         InvalidArgumentError: The split does not exist, the file is that of the other split, or
             ``path`` is no path.
-        InputNotFoundError: The path does not exist, or the folder has none of these files.
-        InputError: A file cannot be opened or read.
+        InputError: The path does not exist or cannot be read, or the folder has no such file.
         FileFormatError: A file does not conform to its format, or has no camera of the split.
 
     Example:
@@ -220,7 +206,11 @@ def _folder_views(folder: Path, split: Split | None) -> list[View]:
             return hold_out(colmap_views(model), split)
     if is_file(folder / "cameras.json"):
         return _file_views(folder / "cameras.json", split)
-    raise InputNotFoundError(f"{folder}: the folder must hold {_KNOWN_FILES}; found none of them.")
+    raise InputNotFoundError(
+        f"{folder}: the folder must hold transforms.json, transforms_train.json, "
+        f"transforms_test.json, a COLMAP model (in sparse/0, sparse or the folder itself) or "
+        f"cameras.json; found none of them."
+    )
 
 
 def _file_views(path: Path, split: Split | None) -> list[View]:

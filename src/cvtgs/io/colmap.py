@@ -31,19 +31,15 @@ class _Image(NamedTuple):
 
     name: str
     camera: int
-    pose: Sequence[float]
-    """From world to camera: a quaternion, w first, of any length but 0, and a translation."""
+    pose: Sequence[float]  # world to camera: a quaternion, w first, of any length, a translation
 
 
 class _Model(NamedTuple):
-    """A COLMAP camera model that a pinhole camera can replace.
+    """A COLMAP camera model that a pinhole camera can replace."""
 
-    Its number in binary files, and the numbers of its parameters and of focal lengths among them.
-    """
-
-    number: int
+    number: int  # in binary files
     parameters: int
-    focals: int
+    focals: int  # how many of the parameters are focal lengths
 
 
 _MODELS: Mapping[str, _Model] = {
@@ -71,14 +67,12 @@ def is_colmap(folder: Path) -> bool:
 
 def colmap_views(folder: Path, *, as_text: bool = False) -> list[View]:
     """Read a sparse model; binary files take precedence, unless its text files are asked for."""
-    if is_file(folder / "images.bin") and not as_text:
-        lenses = _cameras_of_bin(folder / "cameras.bin")
-        images = _images_of_bin(folder / "images.bin")
-        path = folder / "images.bin"
+    path = folder / "images.bin"
+    if is_file(path) and not as_text:
+        lenses, images = _cameras_of_bin(folder / "cameras.bin"), _images_of_bin(path)
     else:
-        lenses = _cameras_of_txt(folder / "cameras.txt")
-        images = _images_of_txt(folder / "images.txt")
         path = folder / "images.txt"
+        lenses, images = _cameras_of_txt(folder / "cameras.txt"), _images_of_txt(path)
     images.sort(key=lambda image: image.name)
     for image in images:
         if image.camera not in lenses:
@@ -122,20 +116,12 @@ def _lens_of(
     model: _Model, parameters: Sequence[float], *, width: int, height: int, where: str
 ) -> Lens:
     """Return the pinhole part of a camera."""
-    focals = parameters[: model.focals]
+    fx, fy = parameters[0], parameters[model.focals - 1]
     cx, cy, *distortion = parameters[model.focals :]
     for value in distortion:
         if not math.isfinite(value):
             raise FileFormatError(f"{where}: the distortion must be finite, found {value}.")
-    lens = Lens(
-        fx=focals[0],
-        fy=focals[-1],
-        cx=cx,
-        cy=cy,
-        width=width,
-        height=height,
-        distorted=any(value != 0 for value in distortion),
-    )
+    lens = Lens(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distorted=any(distortion))
     return checked_lens(lens, where)
 
 
@@ -162,8 +148,7 @@ class _Bytes:
         text, zero, _ = self.file.read(_MAX_NAME + 1).partition(b"\0")
         if not zero:
             raise FileFormatError(
-                f"{self.path}: the name of {what} must end within {_MAX_NAME:,} bytes, "
-                f"found no end."
+                f"{self.path}: the name of {what} must end within {_MAX_NAME:,} bytes, found none."
             )
         self.file.seek(start + len(text) + 1)
         return _text_of(text)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.errors import CvtgsError, FileFormatError, InvalidSceneError, is_out_of_memory, warn
-from cvtgs.io.files import check_stored, is_file, open_input
+from cvtgs.io.files import is_file, open_input
 from cvtgs.math import parameters
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene, check_scene
@@ -39,25 +39,20 @@ _KNOWN = (
     "shN (or features_rest)"
 )
 
+_FEWEST_JUDGED = 100  # values of fewer Gaussians are never reported as unlikely
+# Scales look activated if all are above 0 and their median is below this. As logarithms, they
+# would be of Gaussians of nearly one size above one unit; standard deviations are often like that.
+_SMALL_SCALE = 0.5
 
-FEWEST_JUDGED = 100  # values of fewer Gaussians are never reported as unlikely
-
-SMALL_SCALE = 0.5
-"""Scales look activated if all are above 0 and their median is below this. As logarithms, they
-would be of Gaussians of nearly one size above one unit; standard deviations are often like that."""
-
+# Names that a checkpoint may refer to: those that tensors and numbers need. ``torch.FloatStorage``
+# and the like only name a type, but the classes in ``torch.storage`` can be called: such a tensor
+# would show what the process had in its memory before.
 _ALLOWED = re.compile(
     r"collections\.(OrderedDict|defaultdict)|torch\._utils\._rebuild_(tensor(_v2)?|parameter)|"
     r"torch\.(\w+Storage|Size|device|u?int\d+|b?float\d+(_\w+)?|bool|nn\.parameter\.Parameter)|"
     r"numpy(\._?core\.multiarray\.scalar|\.dtype)|_codecs\.encode|"
     r"(builtins|__builtin__)\.(dict|list|set|tuple|int|float|complex)"
 )
-"""Names that a checkpoint may refer to: those that tensors and numbers need.
-
-``torch.FloatStorage`` and the like only name a type, but the classes in ``torch.storage`` can be
-called: such a tensor would show what the process had in its memory before.
-"""
-
 _NUMPY_NAMES = {
     "numpy.dtype",
     "numpy.core.multiarray.scalar",  # numpy 1
@@ -125,7 +120,7 @@ def from_dict(
         tensors["log_scales"] = parameters.positive_log(scales)
         tensors["logit_opacities"] = parameters.logit_from_opacity(opacities)
     scene = GaussianScene(**tensors, extras={}, comments=(), layout=())
-    if not activated and (unlikely := activated_values(scene)):
+    if not activated and (unlikely := _activated_values(scene)):
         warn(
             f"{' and '.join(unlikely)}: they are read as stored values (logarithms of scales, "
             f"logits of opacities) but look activated; if they are, pass activated=True."
@@ -133,16 +128,16 @@ def from_dict(
     return scene
 
 
-def activated_values(scene: GaussianScene) -> list[str]:
+def _activated_values(scene: GaussianScene) -> list[str]:
     """Describe the scales and opacities of a scene that look activated instead of stored."""
-    if len(scene) < FEWEST_JUDGED:
+    if len(scene) < _FEWEST_JUDGED:
         return []
     found = []
     least, most = (float(value) for value in scene.logit_opacities.aminmax())
     if 0 <= least < most <= 1:
         found.append(f"opacities from {least:.3g} to {most:.3g}")
     least, most = (float(value) for value in scene.log_scales.aminmax())
-    if least > 0 and float(scene.log_scales.median()) < SMALL_SCALE:
+    if least > 0 and float(scene.log_scales.median()) < _SMALL_SCALE:
         found.append(f"scales from {least:.3g} to {most:.3g}")
     return found
 
@@ -181,7 +176,13 @@ def to_dict(scene: GaussianScene) -> dict[str, Tensor]:
 
 
 def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
-    prefix = _prefix(mapping)
+    """Return the key of each tensor; their common prefix is the text before ``means``."""
+    ends = [key for key in mapping if str(key) == "means" or str(key).endswith(".means")]
+    if len(ends) > 1:
+        raise InvalidSceneError(
+            f"a dictionary must hold means only once, found {' and '.join(map(repr, ends))}."
+        )
+    prefix = ends[0].removesuffix("means") if ends else ""
     keys: dict[str, str] = {}
     for key in mapping:
         is_text = isinstance(key, str)
@@ -206,17 +207,7 @@ def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
     return keys
 
 
-def _prefix(mapping: Mapping[str, Any]) -> str:
-    """Return the common prefix of the names, which is the text before ``means``."""
-    found = [key for key in mapping if str(key) == "means" or str(key).endswith(".means")]
-    if len(found) > 1:
-        raise InvalidSceneError(
-            f"a dictionary must hold means only once, found {' and '.join(map(repr, found))}."
-        )
-    return found[0].removesuffix("means") if found else ""
-
-
-def check_tensors(mapping: Mapping[Any, Any]) -> None:
+def _check_tensors(mapping: Mapping[Any, Any]) -> None:
     """Check that values are dense tensors of rows in memory, before any is copied."""
     for name, value in mapping.items():
         if not isinstance(value, Tensor):
@@ -244,7 +235,7 @@ def _as_tensor(key: str, value: Tensor | NDArray[Any]) -> Tensor:
             f"{key} must be a torch.Tensor or numpy array of floats, "
             f"found {getattr(value, 'dtype', type(value).__name__)}."
         )
-    check_tensors({key: value})
+    _check_tensors({key: value})
     return value.detach()
 
 
@@ -259,16 +250,9 @@ def _check_values(name: str, wrong: Tensor, *, required: str) -> None:
 
 
 def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
-    """Read the scene of a checkpoint.
+    """Read the scene of a checkpoint of nerfstudio's Splatfacto or gsplat's trainer.
 
-    Two kinds are supported: ``step-000029999.ckpt`` of nerfstudio, which holds the scene under
-    ``pipeline`` as ``_model.gauss_params.means`` (``_model.means`` before 2024) and so on; and
-    ``ckpt_29999_rank0.pt`` of gsplat's examples, which holds it under ``splats``. A dictionary of
-    the tensors alone, with the names of gsplat, is read, too. Nothing in the file is executed, and
-    only the scene is loaded, not the state of the optimiser. At SH degree 0, Splatfacto trains
-    colours through a sigmoid; these are converted to the usual ``sh0``. A tensor that repeats
-    numbers instead of storing them is refused, unless sizes are trusted. gsplat's trainer writes a
-    part of the scene for each of several GPUs; a warning names the other files.
+    Nothing in the file is executed, and only the scene is loaded, not the state of the optimiser.
     """
     second = path.with_name(path.name.replace("_rank0.pt", "_rank1.pt"))
     if second != path and is_file(second):
@@ -278,9 +262,9 @@ def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
         )
     try:
         tensors, splatfacto = _scene_tensors(_unpickled(path), path)
-        check_tensors(tensors)
+        _check_tensors(tensors)
         if not trust_sizes:
-            check_stored(path, tensors)
+            _check_stored(path, tensors)
         scene = from_dict({name: tensor.clone() for name, tensor in tensors.items()})
     except InvalidSceneError as error:
         raise FileFormatError(f"{path}: {error}") from error
@@ -294,9 +278,20 @@ def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
             f"({type(error).__name__})."
         ) from error
     if splatfacto and scene.sh_degree == 0:
-        colors = torch.sigmoid(scene.sh0)
+        colors = torch.sigmoid(scene.sh0)  # through which it trains them at this degree
         return scene.with_tensors({"sh0": (colors - 0.5) / SH_C0}, {})
     return scene
+
+
+def _check_stored(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Refuse tensors that repeat numbers instead of storing each of them."""
+    for name, tensor in tensors.items():
+        wanted, stored = tensor.numel() * tensor.element_size(), tensor.untyped_storage().nbytes()
+        if wanted > stored:
+            raise FileFormatError(
+                f"{path}: {shown(name)} must store each of its {wanted:,} bytes, found {stored:,}; "
+                f"if you trust the file, pass trust_sizes=True (--trust-sizes)."
+            )
 
 
 def _scene_tensors(content: Any, path: Path) -> tuple[dict[str, Tensor], bool]:
@@ -341,7 +336,6 @@ def _unpickled(path: Path) -> Any:
 def _names_in(path: Path) -> Iterator[str]:
     """Yield the names in the pickles of a checkpoint, and what ``torch.save`` never writes.
 
-    That is codecs from bytes to bytes, other protocols, of which torch warns, and compression.
     ``weights_only`` blocks code, but allows ``bytearray`` and other names that take any memory.
     """
     with zipfile.ZipFile(path) as archive:
@@ -356,7 +350,7 @@ def _names_in(path: Path) -> Iterator[str]:
                 for operation, value, _ in pickletools.genops(archive.read(entry)):
                     if operation.name in ("GLOBAL", "INST"):
                         yield str(value).replace(" ", ".")
-                    elif operation.name == "PROTO" and value != 2:
+                    elif operation.name == "PROTO" and value != 2:  # torch would warn
                         yield f"protocol {value}"
                     elif isinstance(value, str) and _BYTE_CODECS.fullmatch(value):
                         yield value
@@ -374,10 +368,9 @@ class _IgnoredType:
 
 @contextmanager
 def _numpy_numbers_ignored() -> Iterator[None]:
-    """Let torch's restricted unpickler ignore numpy scalars (learning rates of schedulers).
+    """Let torch's unpickler ignore numpy scalars (learning rates), which it would refuse.
 
-    It would refuse them. Stand-ins with the same names take their place, in the whole process: only
-    one file is read so at a time, and names that the program adds meanwhile stay.
+    Names that it allows are of the whole process; those that the program adds meanwhile stay.
     """
     stand_ins: list[Any] = [codecs.encode]  # torch 2.6 and later allows it anyway
     for path in sorted(_NUMPY_NAMES - {"_codecs.encode"}):

@@ -4,7 +4,7 @@ import json
 import os
 import re
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, BinaryIO, ClassVar, TypeVar, get_args
@@ -12,7 +12,6 @@ from urllib.parse import unquote
 
 import pydantic
 from pydantic import AllowInfNan, BeforeValidator, Field, Strict
-from torch import Tensor
 
 from cvtgs.counts import whole_number
 from cvtgs.errors import (
@@ -26,18 +25,13 @@ from cvtgs.errors import (
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.text import shown
 
-_POINTER = b"version https://git-lfs."
-"""Start of the pointer file that replaces a large file in a clone without Git LFS."""
-
+_POINTER = b"version https://git-lfs."  # replaces a large file in a clone without Git LFS
 _ITERATION = re.compile(r"iteration_(\d{1,18})")
 _STEP = re.compile(r"step-(\d{1,18})\.ckpt")
 _GSPLAT_STEP = re.compile(r"ckpt_(\d+)_rank0\.pt")
 
-
-FREE_BYTES = 1 << 26
-"""A scene of at most this many bytes in memory may come from a file of any size."""
-MOST_EXPANSION = 64
-"""Beyond that, a scene may take this many times the bytes of its file; real ones take 4 to 13."""
+FREE_BYTES = 1 << 26  # a scene of at most this many bytes in memory may come from any file
+MOST_EXPANSION = 64  # else, it may take this many times the bytes of its file; real ones take 4-13
 MOST_JSON_BYTES = 1 << 26  # a larger .gltf has its buffers inside
 LONGEST_NAME = 255  # characters that file systems allow in a name
 _FLOATS = 11  # numbers of a Gaussian without SH coefficients
@@ -131,8 +125,7 @@ def scene_size(path: str | os.PathLike[str]) -> int:
         other files.
 
     Raises:
-        InputNotFoundError: There is no such file.
-        InputError: The folder holds no scene, or cannot be read.
+        InputError: There is no such file, or the folder holds no scene or cannot be read.
 
     Example:
         >>> import tempfile
@@ -190,11 +183,7 @@ def check_degree(degree: object) -> None:
 
 
 def check_expansion(path: Path | str, *, count: int, sh_degree: int, stored: int) -> None:
-    """Refuse a file that claims far more Gaussians than it can hold.
-
-    Every reader of a compressed format calls this before it decompresses the Gaussians, unless
-    sizes are trusted.
-    """
+    """Refuse a file that claims far more Gaussians than it can hold, before it is unpacked."""
     wanted = 4 * count * (_FLOATS + 3 * (sh_degree + 1) ** 2)
     if wanted > FREE_BYTES + MOST_EXPANSION * stored:
         raise FileFormatError(
@@ -204,32 +193,18 @@ def check_expansion(path: Path | str, *, count: int, sh_degree: int, stored: int
         )
 
 
-def check_stored(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Refuse tensors of a checkpoint that repeat numbers instead of storing each of them."""
-    for name, tensor in tensors.items():
-        wanted, stored = tensor.numel() * tensor.element_size(), tensor.untyped_storage().nbytes()
-        if wanted > stored:
-            raise FileFormatError(
-                f"{path}: {shown(name)} must store each of its {wanted:,} bytes, found {stored:,}; "
-                f"if you trust the file, pass trust_sizes=True (--trust-sizes)."
-            )
-
-
 class Document(pydantic.BaseModel):
     """A JSON object of which some keys are read; errors quote the descriptions of fields."""
 
     model_config: ClassVar[pydantic.ConfigDict] = pydantic.ConfigDict(frozen=True)
 
 
-def _without_point(value: Any) -> Any:
-    return int(value) if isinstance(value, float) and value.is_integer() else value
-
-
 Number = Annotated[float, Strict(), AllowInfNan(False), Field(description="a finite number")]
 Whole = Annotated[
     int,
     Strict(),
-    BeforeValidator(_without_point),  # 800.0
+    # 800.0 counts as 800
+    BeforeValidator(lambda n: int(n) if isinstance(n, float) and n.is_integer() else n),
     Field(ge=-_MOST_WHOLE, le=_MOST_WHOLE, description="a whole number"),
 ]
 Size = Annotated[Whole, Field(ge=0, description="a whole number of at least 0")]

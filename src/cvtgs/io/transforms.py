@@ -4,7 +4,7 @@ import math
 import struct
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import Field
@@ -13,6 +13,7 @@ from cvtgs.errors import FileFormatError, InvalidArgumentError
 from cvtgs.io.cameras import SPLITS, Lens, Split, View, checked_lens, hold_out, viewmat_of_pose
 from cvtgs.io.files import (
     Document,
+    FourNumbers,
     Items,
     Number,
     Text,
@@ -31,8 +32,6 @@ _DISTORTIONS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 _PNG_START = struct.Struct(">8sI4sII")
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-
-_Row = tuple[Number, Number, Number, Number]
 
 
 class _Intrinsics(Document):
@@ -67,9 +66,10 @@ class _Intrinsics(Document):
 
 class _Frame(_Intrinsics):
     file_path: Text
-    transform_matrix: tuple[_Row, _Row, _Row, _Row] | tuple[_Row, _Row, _Row] = Field(
-        description="4 x 4 or 3 x 4 finite numbers"
-    )
+    transform_matrix: Annotated[
+        list[FourNumbers],
+        Field(min_length=3, max_length=4, description="4 x 4 or 3 x 4 finite numbers"),
+    ]
 
 
 class _Transforms(_Intrinsics):
@@ -95,9 +95,9 @@ def inria_views(entries: Sequence[Any], path: Path) -> list[View]:
     for row, entry in enumerate(entries):
         where = f"{path}: camera {row}"
         camera = validated(_InriaCamera, entry, where)
-        width, height = camera.width, camera.height
-        cx, cy = width / 2, height / 2
-        lens = Lens(fx=camera.fx, fy=camera.fy, cx=cx, cy=cy, width=width, height=height)
+        size = {"width": camera.width, "height": camera.height}
+        cx, cy = camera.width / 2, camera.height / 2
+        lens = Lens(fx=camera.fx, fy=camera.fy, cx=cx, cy=cy, **size)
         rotation, position = np.array(camera.rotation), np.array(camera.position)
         viewmat = viewmat_of_pose(rotation, position, where=where)
         views.append(View(name=camera.img_name, viewmat=viewmat, lens=checked_lens(lens, where)))
