@@ -194,7 +194,7 @@ DAMAGED = {
     ),
     "ascii": (
         GOOD.replace(b"binary_little_endian", b"ascii"),
-        "a compressed PLY must be binary_little_endian, found ascii.",
+        "a compressed PLY must be binary_little_endian without lists, found ascii.",
     ),
     "missing": (
         GOOD.replace(b"min_scale_y", b"min_scale_q"),
@@ -217,7 +217,7 @@ DAMAGED = {
     ),
     "list": (
         GOOD.replace(b"end_header", b"element q 0\nproperty list uchar int a\nend_header"),
-        "a compressed PLY must have no list properties, found one.",
+        "a compressed PLY must be binary_little_endian without lists, found a list.",
     ),
 }
 

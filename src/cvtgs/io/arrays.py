@@ -22,8 +22,7 @@ Bytes = NDArray[np.uint8]
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
-HALF_RANGE = np.float32(np.sqrt(0.5))
-"""Upper bound of the magnitudes of the three smaller components of a unit quaternion."""
+HALF_RANGE = np.float32(np.sqrt(0.5))  # bounds the three smaller components of a unit quaternion
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

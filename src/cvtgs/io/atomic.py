@@ -20,21 +20,14 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-_HERE, _NO_REPLACE = -100, 1
-"""AT_FDCWD and RENAME_NOREPLACE of Linux."""
-
+_HERE, _NO_REPLACE = -100, 1  # AT_FDCWD and RENAME_NOREPLACE of Linux
 _WINDOWS = os.name == "nt"
 _RESERVED = {"CON", "PRN", "AUX", "NUL"}
 _RESERVED |= {f"{port}{n}" for port in ("COM", "LPT") for n in "123456789"}
 
-_MOST_WRITERS = 16
-"""Largest number of concurrent writers of an output whose leftovers are found after a kill."""
-
-_OLD_SECONDS = 3600
-"""Without locks, a temporary file that was not written to for this long is a leftover."""
-
-_WAITS = (0.05, 0.1, 0.2, 0.4, 0.8)
-"""Seconds to wait on Windows for programs that hold a file for a moment, such as virus scanners."""
+_MOST_WRITERS = 16  # concurrent writers of an output whose leftovers are found after a kill
+_OLD_SECONDS = 3600  # without locks, a temporary file unchanged for this long is a leftover
+_WAITS = (0.05, 0.1, 0.2, 0.4, 0.8)  # seconds, for virus scanners that hold a file on Windows
 
 
 def check_outputs(
@@ -142,8 +135,11 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
         if fcntl is None:
             _publish(temporary, target, overwrite=overwrite)
     except OSError as error:
-        if isinstance(error, CvtgsError) or not _concerns(error, target):
+        named = error.filename
+        if isinstance(error, CvtgsError):
             raise
+        if named is not None and Path(os.fsdecode(named)).parent != target.parent:
+            raise  # of another file of the caller
         if isinstance(error, FileExistsError):
             raise _exists(path) from error
         raise write_error(path, error) from error
@@ -257,7 +253,7 @@ def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
         replace_file(temporary, target)
         return
-    for take in (_link, _rename):
+    for take in (os.link, _rename):  # unlike a rename, a hard link never replaces
         try:
             take(temporary, target)
         except FileExistsError:
@@ -269,7 +265,7 @@ def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
 
 
 def replace_file(source: Path, target: Path) -> None:
-    """Move a file, or a folder to a new name; see :func:`_patiently` for Windows."""
+    """Move a file, or a folder to a new name."""
     _patiently(source.replace, target)
 
 
@@ -285,11 +281,6 @@ def _patiently(move: Callable[[Path], object], target: Path) -> None:
     move(target)
 
 
-def _link(temporary: Path, target: Path) -> None:
-    """Create a hard link unless the name exists: unlike a rename, a link never replaces."""
-    target.hardlink_to(temporary)
-
-
 def _rename(temporary: Path, target: Path) -> None:
     """Rename unless the name exists, for disks without hard links (FAT, some shares)."""
     if _WINDOWS:
@@ -298,8 +289,8 @@ def _rename(temporary: Path, target: Path) -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     if not hasattr(libc, "renameat2"):
         raise NotImplementedError
-    names = (os.fsencode(temporary), os.fsencode(target))
-    if libc.renameat2(_HERE, names[0], _HERE, names[1], ctypes.c_uint(_NO_REPLACE)):
+    source, name = os.fsencode(temporary), os.fsencode(target)
+    if libc.renameat2(_HERE, source, _HERE, name, ctypes.c_uint(_NO_REPLACE)):
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number), os.fspath(target))
 
@@ -317,13 +308,6 @@ def _claim(temporary: Path, target: Path) -> None:
             if own is not None and os.path.samestat(found, own) and found.st_size == 0:
                 target.unlink()
         raise
-
-
-def _concerns(error: OSError, target: Path) -> bool:
-    """Return whether an error is about this output, not about other files of the caller."""
-    if error.filename is None:
-        return True
-    return Path(os.fsdecode(error.filename)).parent == target.parent
 
 
 def _exists(path: str | os.PathLike[str]) -> OutputExistsError:

@@ -13,21 +13,19 @@ from cvtgs.math.parameters import multiply_quats
 from cvtgs.math.spherical_harmonics import rest_basis, rotated_rest
 from cvtgs.scene import GaussianScene, check_scene
 
-AXES = (
+AXES = (  # where x, y and z point (left, right, up, down, back, forward); SPZ counts from 1
     *("ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf"),
     *("lfd", "rfd", "lfu", "rfu", "lbd", "rbd", "lbu", "rbu"),
 )
-"""Where x, y and z point (left, right, up, down, back, forward); SPZ numbers these from 1."""
 
 SCENE_AXES = "rdf"  # the axes of scenes in memory: right, down, forward, as in PLY files of 3DGS
 
 _DIRECTIONS = {"r": (1, 0, 0), "u": (0, 1, 0), "b": (0, 0, 1)}
 _DIRECTIONS |= {"l": (-1, 0, 0), "d": (0, -1, 0), "f": (0, 0, -1)}
 
-_QUARTER_TURN = torch.tensor(
+_QUARTER_TURN = torch.tensor(  # (x, y, z) becomes (x, -z, y)
     [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], device="cpu"
 ).double()
-"""(x, y, z) becomes (x, -z, y)."""
 
 
 def checked_axes(name: str) -> str:

@@ -34,28 +34,19 @@ __all__ = ["read_compressed_ply", "write_compressed_ply"]
 Rows = NDArray[Any]
 
 _CHUNK_ROWS = 256  # Gaussians in a chunk, which share its ranges
-
-_FLYAWAY_RADII = 30.0
-"""Distance of a flyaway from the middle, in radii that contain 90 % of the scene."""
-
-_RANGES = tuple(
+_FLYAWAY_RADII = 30.0  # of a flyaway from the middle, in radii that contain 90 % of the scene
+_RANGES = tuple(  # properties of a chunk; the oldest files lack those of colours
     f"{end}_{name}"
     for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
     for end in ("min", "max")
     for name in names
 )
-"""Properties of a chunk; the oldest files lack those of colours."""
-
 _UNCOLORED = 12
-
-_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-"""Properties of a vertex, 32 bits each."""
-
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of a vertex
 _THREE_BITS = (11, 10, 11)  # bits of positions and scales
 _COLOR_BITS = (8, 8, 8)  # bits of red, green and blue; the last 8 are those of the opacity
 
-_QUAT_BITS = (10, 10, 10)
-"""Bits of the three smaller components of a rotation; the top two bits index the missing one."""
+_QUAT_BITS = (10, 10, 10)  # of the smaller components; the top two bits index the missing one
 
 
 def read_compressed_ply(path: Path) -> GaussianScene:
@@ -74,7 +65,15 @@ def read_compressed_ply(path: Path) -> GaussianScene:
     with open_input(path) as file:
         header = read_header(file, str(path))
         _check(header, path)
-        tables = _read_tables(file, header, path)
+        check_size(
+            header, header.elements[-1], path=str(path), size=os.fstat(file.fileno()).st_size
+        )
+        file.seek(header.data_offset)
+        tables = {
+            table.name: np.fromfile(file, row_dtype(table.columns), table.count)
+            for table in header.elements
+            if table.properties
+        }
     with np.errstate(all="ignore"):  # damaged ranges give non-finite numbers
         return scene_of(_unpacked(tables), comments=header.comments)
 
@@ -125,9 +124,11 @@ def _rest(rows: Rows | None, count: int) -> Float[np.ndarray, "n k 3"]:
 
 def _check(header: Header, path: Path) -> None:
     found = {table.name: table for table in header.elements}
-    if header.encoding != "binary_little_endian":
+    has_lists = any(table.has_lists for table in header.elements)
+    if header.encoding != "binary_little_endian" or has_lists:
         raise FileFormatError(
-            f"{path}: a compressed PLY must be binary_little_endian, found {header.encoding}."
+            f"{path}: a compressed PLY must be binary_little_endian without lists, found "
+            f"{'a list' if has_lists else header.encoding}."
         )
     chunk = found["chunk"].properties if "chunk" in found else ()
     is_colored = any(prop.name in _RANGES[_UNCOLORED:] for prop in chunk)
@@ -163,19 +164,6 @@ def _check_rest(table: Element, vertices: int, path: Path) -> None:
         )
 
 
-def _read_tables(file: BinaryIO, header: Header, path: Path) -> dict[str, Rows]:
-    """Read every element, after checking that the file is long enough for all."""
-    if any(table.has_lists for table in header.elements):
-        raise FileFormatError(f"{path}: a compressed PLY must have no list properties, found one.")
-    check_size(header, header.elements[-1], path=str(path), size=os.fstat(file.fileno()).st_size)
-    file.seek(header.data_offset)
-    return {
-        table.name: np.fromfile(file, row_dtype(table.columns), table.count)
-        for table in header.elements
-        if table.properties
-    }
-
-
 def write_compressed_ply(scene: GaussianScene, file: BinaryIO) -> None:
     """Write a compressed PLY file.
 
@@ -203,8 +191,7 @@ def write_compressed_ply(scene: GaussianScene, file: BinaryIO) -> None:
 def _flyaways_last(arrays: Arrays, order: NDArray[np.int64]) -> NDArray[np.int64]:
     """Move flyaways to the last chunks, whose positions they round coarsely.
 
-    Chunks are full except the last one, so the first of these also gets other Gaussians: those that
-    are least visible.
+    The first of these is filled up with those of the other Gaussians that are least visible.
     """
     far = np.abs(in_radii(arrays.means)).max(axis=1) > _FLYAWAY_RADII
     count, total = int(far.sum()), len(order)

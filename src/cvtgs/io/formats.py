@@ -7,7 +7,7 @@ from dataclasses import replace
 from inspect import signature
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import BinaryIO, Literal
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 import torch
@@ -32,6 +32,8 @@ from cvtgs.scene import GaussianScene, check_scene
 from cvtgs.tags import TWO_SCALES
 from cvtgs.text import shown
 
+# Readers by suffix, imported when needed; the first suffix that fits counts. Each takes the options
+# of :func:`load` that its format has.
 _READERS: Mapping[str, str] = {
     ".compressed.ply": "cvtgs.io.compressed_ply:read_compressed_ply",
     ".ply": "cvtgs.io.ply:read_ply",
@@ -46,12 +48,6 @@ _READERS: Mapping[str, str] = {
     ".ckpt": "cvtgs.io.dicts:read_checkpoint",
     ".pt": "cvtgs.io.dicts:read_checkpoint",
 }
-"""Readers by suffix, imported when needed; the first suffix that fits counts. Each takes the
-options of :func:`load` that its format has."""
-
-_FILE_AXES = {".spz.glb": "luf", ".glb": "luf", ".gltf": "luf", ".usda": "rub"}
-"""Axes that a format prescribes, by suffix."""
-
 _WRITERS: Mapping[str, str] = {
     ".compressed.ply": "cvtgs.io.compressed_ply:write_compressed_ply",
     ".ply": "cvtgs.io.ply:write_ply",
@@ -63,7 +59,7 @@ _WRITERS: Mapping[str, str] = {
     ".gltf": "cvtgs.io.gltf:write_gltf",
     ".usda": "cvtgs.io.usd:write_usda",
 }
-
+_FILE_AXES = {".spz.glb": "luf", ".glb": "luf", ".gltf": "luf", ".usda": "rub"}  # of formats
 READABLE_SUFFIXES = tuple(name for name in _READERS if name.startswith("."))
 WRITABLE_SUFFIXES = tuple(_WRITERS)
 
@@ -110,8 +106,7 @@ def load(
         The scene: float32, or float64 if the file has double coordinates.
 
     Raises:
-        InputNotFoundError: The file does not exist.
-        InputError: It cannot be opened or read, or the folder holds no scene.
+        InputError: The file does not exist or cannot be read, or the folder holds no scene.
         FileFormatError: The format is unknown, or the file does not conform to it.
         MissingDependencyError: Reading this file needs an optional package.
         DeviceError: The device is not available.
@@ -129,7 +124,9 @@ def load(
     usable_device(device)
     if sh_degree is not None:
         check_degree(sh_degree)
-    axes = None if axes is None else checked_axes(axes)
+    given: dict[str, Any] = {"sh_degree": sh_degree, "extras": extras, "trust_sizes": trust_sizes}
+    given["axes"] = axes = None if axes is None else checked_axes(axes)
+    given["lod"] = 0 if lod is None else lod
     if not isinstance(path, str | os.PathLike):
         if not hasattr(path, "read"):
             raise InvalidArgumentError(
@@ -138,15 +135,7 @@ def load(
         if format is not None:
             format = _suffix_of(_dotted(format) or "", _READERS, format=format)
         with file_of(path, format) as copy:
-            return load(
-                copy,
-                device=device,
-                sh_degree=sh_degree,
-                extras=extras,
-                axes=axes,
-                trust_sizes=trust_sizes,
-                lod=lod,
-            )
+            return load(copy, device=device, **given)
     source = scene_file(path)
     named = _dotted(format) or source
     # the PLY reader raises if there is no file
@@ -155,8 +144,6 @@ def load(
         from cvtgs.io.ply.header import is_compressed_ply  # noqa: PLC0415 (loaded as readers are)
 
         suffix = ".compressed.ply" if is_compressed_ply(source) else ".ply"
-    given = {"sh_degree": sh_degree, "extras": extras, "axes": axes, "trust_sizes": trust_sizes}
-    given["lod"] = 0 if lod is None else lod
     with memory_errors(f"{source}: reading the scene", BLOCKS_ADVICE):
         read: Callable[..., GaussianScene] = resolve_name(_READERS[suffix])
         options = {name: given[name] for name in signature(read).parameters if name in given}

@@ -1,7 +1,7 @@
 """Limits of each format, and the data of a scene that is lost in it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -11,9 +11,7 @@ from cvtgs.tags import ANTIALIASED, TWO_SCALES
 from cvtgs.text import counted, first_of
 from cvtgs.validity import coarse_step, lost_step, writable_rows
 
-SPZ_STEPS = 1 << 23
-"""Steps of the coordinates of a ``.spz`` on each side of the origin."""
-
+SPZ_STEPS = 1 << 23  # of the coordinates of a ``.spz``, on each side of the origin
 SCALE_RANGE = (-87.34, 88.7)  # logarithms of the scales that float32 holds with full precision
 
 
@@ -36,28 +34,20 @@ class Losses:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FormatLimits:
-    """The limits of files of a format."""
+    """The limits of files of a format, and phrases for what is rounded or reordered."""
 
     sh_degree: int = 3
-    antialiased: bool = True
-    """Whether files record that a scene was trained with anti-aliasing."""
+    antialiased: bool = True  # whether files record that a scene was trained with anti-aliasing
     comments: bool = False
-    two_scales: bool = False
-    """Whether files record that Gaussians are flat, unless they record anti-aliasing; files with
-    comments do so by a tag."""
-    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Minimum and maximum of the values of a tensor, by its name."""
-    fixed_point: bool = False
-    """Whether files hold positions in fixed point, so that coordinates are limited."""
+    two_scales: bool = False  # whether files record flatness without comments or anti-aliasing
+    ranges: Mapping[str, tuple[float, float]]  # of the values of a tensor, by its name
+    fixed_point: bool = False  # of positions, so that coordinates are limited
     changed: tuple[str, ...]
-    """Phrases for data that are rounded or reordered."""
-    changed_bands: str = ""
-    """The same for the SH bands above the constant one."""
+    changed_bands: str = ""  # of the SH above the constant band
 
 
 LOST_DIGITS = "digits of positions"
 _USUAL_SPZ_STEP = 1 / 4096
-_SPZ_ROTATIONS = "rotations in steps of 1/723 per component"
 
 _SPZ = FormatLimits(  # of versions 3 and 4
     ranges={
@@ -70,21 +60,14 @@ _SPZ = FormatLimits(  # of versions 3 and 4
         "positions in steps of 1/4096 (finer in scenes below 8 units, coarser beyond 2,048 units "
         "from the origin)",
         "scales in steps of 6.4 %",
-        _SPZ_ROTATIONS,
+        "rotations in steps of 1/723 per component",
         "opacities in steps of 1/255",
         "colours in steps of 0.0074",
     ),
     changed_bands="view-dependent SH coefficients in steps of 1/16 (degree 1) and 1/8",
 )
 
-SPZ_2 = replace(
-    _SPZ,
-    changed=tuple(
-        "rotations in steps of 1/127 per component" if phrase == _SPZ_ROTATIONS else phrase
-        for phrase in _SPZ.changed
-    ),
-)
-"""What a ``.spz`` of version 2 loses."""
+SPZ_2 = replace(_SPZ, changed=tuple(one.replace("1/723", "1/127") for one in _SPZ.changed))
 
 _GLTF = FormatLimits(
     comments=True,
@@ -92,7 +75,7 @@ _GLTF = FormatLimits(
     changed=("scales and opacities as float32 instead of their logarithms and logits",),
 )
 
-FORMAT_LIMITS: Mapping[str, FormatLimits] = {
+FORMAT_LIMITS: Mapping[str, FormatLimits] = {  # by suffix; ``.ply`` has none
     ".compressed.ply": FormatLimits(
         comments=True,
         ranges={"log_scales": (-20.0, 20.0), "shN": (-4.0, 4.0)},
@@ -122,6 +105,7 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = {
     ),
     ".sog": FormatLimits(
         two_scales=True,
+        ranges={},
         changed=(
             "rows in Morton order",
             "positions in 65,536 steps of sign(x) log(1 + |x|) between minimum and maximum",
@@ -133,7 +117,6 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = {
         "palette of at least half as many entries as Gaussians and at most 65,536",
     ),
 }
-"""Limits by suffix; ``.ply`` has none."""
 
 _VALUES = {
     "means": "coordinates",
@@ -179,8 +162,8 @@ def dropped_within(scene: GaussianScene, limits: FormatLimits) -> dict[str, int]
     if scene.antialiased and not limits.antialiased:
         tag = f"the tag '{ANTIALIASED.text}', without which viewers show the scene too sharp"
         dropped[tag] = 0
-    records_flatness = limits.comments or (limits.two_scales and not scene.antialiased)
-    if scene.has_two_scales and not records_flatness:
+    keeps_flatness = limits.comments or (limits.two_scales and not scene.antialiased)
+    if scene.has_two_scales and not keeps_flatness:
         tag = f"the tag '{TWO_SCALES.text}', without which merged Gaussians of the file are thick"
         dropped[tag] = 0
     if scene.dtype == torch.float64:
@@ -190,13 +173,10 @@ def dropped_within(scene: GaussianScene, limits: FormatLimits) -> dict[str, int]
         count = int((~rows).sum())
         verbs = "is not finite or has" if count == 1 else "are not finite or have"
         dropped[f"{counted(count, 'Gaussian')} that {verbs} no rotation"] = 0
-    ranges, step = _ranges(scene, limits), 0.0
-    if scene.dtype == torch.float64:
-        step = lost_step(scene, in_file=True)
-    if limits.fixed_point:
-        largest = ranges["means"][1]
-        if largest / SPZ_STEPS > _USUAL_SPZ_STEP:
-            step = max(step, coarse_step(scene, largest / SPZ_STEPS))
+    ranges = _ranges(scene, limits)
+    step = lost_step(scene, in_file=True) if scene.dtype == torch.float64 else 0.0
+    if limits.fixed_point and (spz_step := ranges["means"][1] / SPZ_STEPS) > _USUAL_SPZ_STEP:
+        step = max(step, coarse_step(scene, spz_step))
     if step > 0:
         far = f"steps of {step:.3g} so far from the origin; convert --translate moves a scene"
         dropped[f"{LOST_DIGITS} ({far})"] = 0

@@ -16,11 +16,7 @@ from cvtgs.io.files import LONGEST_NAME, is_folder
 
 @contextmanager
 def output_lock(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Hold the lock of an output, a hidden file ``.NAME.lock`` beside it.
-
-    The system releases it when the process ends, in whichever way. The file is removed on release,
-    or by the next run after a kill.
-    """
+    """Hold the lock of an output, a hidden file, which the system releases after a kill."""
     from filelock import FileLock, SoftFileLock, Timeout  # noqa: PLC0415 (loaded when used)
 
     file = lock_path(path)
@@ -39,8 +35,11 @@ def output_lock(path: str | os.PathLike[str]) -> Iterator[None]:
     is_soft = isinstance(lock, SoftFileLock)  # its file has its own content
     try:
         if not is_soft:
+            command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:2]]) if sys.argv else "python"
+            holder = {"process": os.getpid(), "host": socket.gethostname(), "command": command}
+            holder["since"] = time.strftime("%Y-%m-%d %H:%M:%S")
             with suppress(OSError):  # a locked file cannot be written to on Windows
-                file.write_text(_signature(), encoding="utf-8")
+                file.write_text(json.dumps(holder), encoding="utf-8")
         yield
     finally:
         if os.name == "posix" and not is_soft:  # while locked, so no other lock is removed
@@ -51,10 +50,7 @@ def output_lock(path: str | os.PathLike[str]) -> Iterator[None]:
 
 @contextmanager
 def folder_lock(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Hold the lock of a folder to write several files to, as :func:`output_lock` does.
-
-    If no file can be created there, nothing is locked, so that the writer reports the fault.
-    """
+    """Hold the lock of a folder to write to; no lock if it takes no files, as the writer says."""
     place = lock_path(path).parent
     usable = place.is_dir() and os.access(place, os.W_OK | os.X_OK)
     with output_lock(path) if usable else nullcontext():
@@ -67,10 +63,9 @@ def lock_path(path: str | os.PathLike[str]) -> Path:
 
 
 def hidden_path(path: str | os.PathLike[str], ending: str) -> Path:
-    """Return a hidden path that belongs to an output: beside it, or in it if need be.
+    """Return a hidden path beside an output, from which files can be moved to it.
 
-    That is so for a folder whose parent is not writable or on another disk (a mounted folder, such
-    as a volume of Docker), so that files can be moved from this path to the folder.
+    It is in a folder whose parent is not writable or on another disk, such as a volume of Docker.
     """
     target = Path(os.path.realpath(path))
     is_apart = os.path.ismount(target) or not os.access(target.parent, os.W_OK | os.X_OK)
@@ -82,14 +77,6 @@ def hidden_path(path: str | os.PathLike[str], ending: str) -> Path:
         start = own[: LONGEST_NAME // 2].decode(errors="ignore")
         name = f".{start}.{sha256(own).hexdigest()[:16]}.{ending}"
     return target.with_name(name)
-
-
-def _signature() -> str:
-    """Describe this process for other processes."""
-    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:2]]) if sys.argv else "python"
-    started = time.strftime("%Y-%m-%d %H:%M:%S")
-    holder = {"process": os.getpid(), "host": socket.gethostname()}
-    return json.dumps({**holder, "command": command, "since": started})
 
 
 def _holder(file: Path) -> str:

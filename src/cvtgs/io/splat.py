@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import struct
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -26,40 +27,23 @@ from cvtgs.io.arrays import (
 from cvtgs.io.files import open_input
 from cvtgs.scene import GaussianScene
 
-_ROW = np.dtype(
-    [
-        ("mean", "<f4", 3),
-        ("scale", "<f4", 3),
-        ("rgb", "u1", 3),
-        ("opacity", "u1"),
-        ("quat", "u1", 4),
-    ]
-)
+_FLOATS = [("mean", "<f4", 3), ("scale", "<f4", 3)]
+_ROW = np.dtype([*_FLOATS, ("rgb", "u1", 3), ("opacity", "u1"), ("quat", "u1", 4)])
 _OTHERS = (b"ply\n", b"ply\r", b"<!do", b"<htm", b"<?xm")  # starts of PLY files and web pages
 _CHUNK_ROWS = 1 << 16
 
-HEADER_BYTES = 4096
-
+_HEADER_BYTES = 4096
 _HEADER = struct.Struct("<BBxxIIIIHxx3fff")
-
 _SECTION = struct.Struct("<IIIIfHxxIIIIH982x")
-
+# Types of positions, of scales and rotations, and of SH, by compression level.
 _NUMBERS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
-"""Types of positions, of scales and rotations, and of SH, by compression level."""
-
 _RANGE = 32767  # quantised positions are centred on this number, unless the section states another
-
 _SH_RANGE = (-1.5, 1.5)  # 0 in the header stands for the usual bound
-
 _COMPONENTS = (0, 9, 24)  # view-dependent SH components of a Gaussian, by degree
 
 
 def read_splat(path: Path) -> GaussianScene:
-    """Read a ``.splat`` file.
-
-    A Gaussian is three f32 of position, three f32 of scale (not its logarithm), and eight bytes:
-    red, green, blue, opacity, and the quaternion, w first, as ``128 + 128 q``.
-    """
+    """Read a ``.splat`` file; scales are no logarithms, quaternions (w first) ``128 + 128 q``."""
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
         start = file.read(4)
@@ -100,8 +84,7 @@ class _Section(NamedTuple):
     """The header of a section."""
 
     used: int
-    room: int
-    """Number of Gaussians that the section has bytes for."""
+    room: int  # number of Gaussians that the section has bytes for
     bucket_size: int
     buckets: int
     block_size: float
@@ -119,19 +102,13 @@ class _Section(NamedTuple):
 
 
 def read_ksplat(path: Path) -> GaussianScene:
-    """Read a ``.ksplat`` file.
-
-    The file has sections of Gaussians in buckets. Positions, scales and rotations are f32; or
-    positions are 16 bits about the centre of the bucket, and scales and rotations are halves.
-    Opacities and colours are bytes; SH up to degree 2 are f32, halves or bytes.
-    """
+    """Read a ``.ksplat`` file: sections of buckets of Gaussians, in one of several precisions."""
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
-        head = file.read(HEADER_BYTES)
-        if len(head) < HEADER_BYTES:
+        head = file.read(_HEADER_BYTES)
+        if len(head) < _HEADER_BYTES:
             raise FileFormatError(
-                f"{path}: a .ksplat file must start with a header of {HEADER_BYTES} bytes, "
-                f"found {len(head)}."
+                f"{path}: must start with a header of {_HEADER_BYTES} bytes, found {len(head)}."
             )
         major, minor, most, _, _, count, level, *_, low, high = _HEADER.unpack_from(head)
         if (major, minor) != (0, 1) or level >= len(_NUMBERS):
@@ -139,7 +116,7 @@ def read_ksplat(path: Path) -> GaussianScene:
                 f"{path}: must be a .ksplat of version 0.1 with compression 0, 1 or 2, found "
                 f"version {major}.{minor} and compression {level}."
             )
-        if HEADER_BYTES + most * _SECTION.size > size:
+        if _HEADER_BYTES + most * _SECTION.size > size:
             raise FileFormatError(
                 f"{path}: must hold the headers of {most:,} sections, found {size:,} bytes."
             )
@@ -186,15 +163,10 @@ def _read_section(
 ) -> Arrays:
     left = os.fstat(file.fileno()).st_size - file.tell()
     needed = section.extra_bytes + row.itemsize * section.used
-    if section.used > section.room:
+    if section.used > section.room or needed > left:
         raise FileFormatError(
-            f"{path}: a section with room for {section.room:,} Gaussians must not hold more, "
-            f"found {section.used:,}."
-        )
-    if needed > left:
-        raise FileFormatError(
-            f"{path}: a section of {section.used:,} Gaussians must take {needed:,} bytes, "
-            f"found {left:,}."
+            f"{path}: a section of {section.used:,} Gaussians must take {needed:,} bytes, found "
+            f"{left:,} with room for {section.room:,} Gaussians."
         )
     lengths = np.fromfile(file, "<u4", section.partial_buckets).astype(np.int64)
     extra = np.fromfile(file, np.uint8, section.bucket_bytes * section.buckets)
@@ -236,11 +208,8 @@ def _buckets(section: _Section, lengths: Int[np.ndarray, "p"]) -> Int[np.ndarray
 def _rest(stored: Float[np.ndarray, "n c"], degree: int) -> Float[np.ndarray, "n k 3"]:
     """Reorder SH components, stored by band and then by channel; missing bands are 0."""
     rest = np.zeros((len(stored), _COMPONENTS[degree] // 3, 3), np.float32)
-    start = 0
-    for band in (1, 2):
-        width = 2 * band + 1
-        if stored.shape[1] >= start + 3 * width:
-            part = stored[:, start : start + 3 * width].reshape(len(stored), 3, width)
-            rest[:, start // 3 : start // 3 + width] = part.transpose(0, 2, 1)
-        start += 3 * width
+    for start, end in pairwise(_COMPONENTS):
+        if stored.shape[1] >= end:
+            part = stored[:, start:end].reshape(len(stored), 3, -1)
+            rest[:, start // 3 : end // 3] = part.transpose(0, 2, 1)
     return rest

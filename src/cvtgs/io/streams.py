@@ -47,17 +47,19 @@ def file_of(
     name: str | None = None,
     advice: str = "give format= for other formats, such as '.splat'",
 ) -> Iterator[Path]:
-    """Copy the rest of a stream to a temporary file, which exists while the context is open.
+    """Copy the rest of a stream to a temporary file; errors and warnings name the stream instead.
 
-    Errors and warnings in the context that name the file name the stream instead, by ``name`` or
-    its own name. ``advice`` ends the error message if the first bytes match no format.
+    ``advice`` ends the error message if the first bytes match no format.
     """
     name = name or name_of(stream)
     chunks, start = _chunks(stream, name), b""
     while len(start) < _MOST_FIRST_BYTES and (chunk := next(chunks, b"")):
         start += chunk
-    if format is None:
-        _check_start(start, name, advice)
+    if format is None and not start.startswith((b"PK", *_FIRST_BYTES)):
+        raise FileFormatError(
+            f"{name}: the first bytes must be those of a .ply, .spz, .sog, .glb or .pt, found "
+            f"{start[:_MOST_FIRST_BYTES]!r}; {advice}."
+        )
     with ExitStack() as stack:
         try:
             temporary = TemporaryDirectory(prefix="cvtgs-", ignore_cleanup_errors=True)
@@ -78,7 +80,10 @@ def file_of(
         try:
             yield path
         except CvtgsError as error:
-            _free_frames(error)
+            part: BaseException | None = error
+            while part is not None:  # Windows does not remove files that finished calls mapped
+                clear_frames(part.__traceback__)
+                part = part.__cause__ or part.__context__
             text = str(error)
             if folder not in text:
                 raise
@@ -90,14 +95,6 @@ def _no_room(what: str, error: OSError) -> OutputError:
         f"the folder of temporary files must be writable and have room for a copy {what}, found: "
         f"{reason_of(error)}; TMPDIR sets another folder."
     )
-
-
-def _free_frames(error: BaseException) -> None:
-    """Free what the finished calls of an error hold: Windows does not remove mapped files."""
-    part: BaseException | None = error
-    while part is not None:
-        clear_frames(part.__traceback__)
-        part = part.__cause__ or part.__context__
 
 
 @contextmanager
@@ -172,15 +169,6 @@ def copy_to(stream: ByteSink, file: BinaryIO) -> None:
                 raise BlockingIOError("it takes no more bytes without blocking")
             chunk = chunk[count:]
             count = stream.write(chunk)
-
-
-def _check_start(start: bytes, name: str, advice: str) -> None:
-    """Check that the first bytes of a stream are those of a known format."""
-    if not start.startswith((b"PK", *_FIRST_BYTES)):
-        raise FileFormatError(
-            f"{name}: the first bytes must be those of a .ply, .spz, .sog, .glb or .pt, found "
-            f"{start[:_MOST_FIRST_BYTES]!r}; {advice}."
-        )
 
 
 def _format_of(path: Path, start: bytes) -> str:

@@ -103,9 +103,15 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
 def _places(meta: _LodMeta, lod: int, path: Path) -> Iterator[tuple[int, _Rows]]:
     """Yield the rows of every chunk at ``lod`` or the level that stands for it, and that level."""
     for chunk, levels in enumerate(_chunks(meta.tree, path)):
-        level = _level_of(levels, lod, f"{path}: chunk {chunk}")
-        if level is None:
+        wrong = [key for key in levels if not (key.isascii() and key.isdigit() and len(key) < 4)]
+        if wrong:
+            raise FileFormatError(
+                f"{path}: chunk {chunk}: levels must be whole numbers, found {shown(wrong[0])}."
+            )
+        if not levels:
             continue
+        numbers = sorted(map(int, levels))
+        level = next((number for number in numbers if number >= lod), numbers[-1])
         rows = validated(_Rows, levels[str(level)], f"{path}: chunk {chunk}, level {level}")
         if rows.file >= len(meta.filenames):
             raise FileFormatError(
@@ -124,15 +130,6 @@ def _chunks(tree: dict[str, Any], path: Path) -> Iterator[dict[str, Any]]:
             yield node.lods
         else:
             waiting += reversed(node.children)
-
-
-def _level_of(levels: dict[str, Any], lod: int, where: str) -> int | None:
-    """Return the level of a chunk to read: ``lod``, the next coarser one, or the coarsest."""
-    wrong = [key for key in levels if not (key.isascii() and key.isdigit() and len(key) < 4)]
-    if wrong:
-        raise FileFormatError(f"{where}: levels must be whole numbers, found {shown(wrong[0])}.")
-    numbers = sorted(map(int, levels))
-    return next((number for number in numbers if number >= lod), numbers[-1] if numbers else None)
 
 
 def _check_count(

@@ -28,21 +28,15 @@ from cvtgs.math.spherical_harmonics import degree_of
 from cvtgs.scene import GaussianScene
 
 _TIME = (1980, 1, 1, 0, 0, 0)  # fixed, so that the same scene gives the same bytes
-
-Images = dict[str, UInt8[np.ndarray, "h w 4"]]
-
-
-CODES = 256
-PALETTE = 1 << 16
+_CODES = 256
+_PALETTE = 1 << 16
 _ITERATIONS = 30
 _KNOTS = 4096
-_WIDEST_GAP = 1 / 64
-"""Largest share of the first codes that lie between two neighbouring knots, such as a value and an
-outlier."""
-_LARGEST_SHIFTED = 1e15
-"""Values this far from the median are not told apart in a palette, so that squares stay finite."""
-_RELATIVE_ROUNDING = 1e-5
-"""Variances below this share of the mean square may be rounding errors of float32."""
+_WIDEST_GAP = 1 / 64  # most of the first codes between two knots, such as a value and an outlier
+_LARGEST_SHIFTED = 1e15  # from the median; beyond it, values are not told apart in a palette
+_RELATIVE_ROUNDING = 1e-5  # smaller variances, relative to mean squares, may be rounding errors
+
+Images = dict[str, UInt8[np.ndarray, "h w 4"]]
 
 
 class EncodedSog(NamedTuple):
@@ -102,10 +96,12 @@ def _encoded(arrays: Arrays, order: Int[np.ndarray, "n"], scene: GaussianScene) 
         meta |= {"model": "antialiased", "antialias": True}
     elif scene.has_two_scales:
         meta["model"] = "2dgs"
+    largest, others = drop_largest(arrays.quats[order])
+    tags = QUAT_TAG + largest
     images, ranges = _means(arrays.means[order])
     images |= {
         "scales": _image(scales.labels),
-        "quats": _image(*_quats(arrays.quats[order])),
+        "quats": _image(to_bytes(np.float32(127.5) * (others / HALF_RANGE + 1)), to_bytes(tags)),
         "sh0": _image(colors.labels, opacities),
     }
     meta |= {
@@ -130,13 +126,6 @@ def _means(means: Float[np.ndarray, "n 3"]) -> tuple[Images, dict[str, list[floa
         "means_u": _image((steps >> np.uint16(8)).astype(np.uint8)),
     }
     return images, {"mins": low.tolist(), "maxs": high.tolist()}
-
-
-def _quats(
-    quats: Float[np.ndarray, "n 4"],
-) -> tuple[UInt8[np.ndarray, "n 3"], UInt8[np.ndarray, "n"]]:
-    largest, others = drop_largest(quats)
-    return to_bytes(np.float32(127.5) * (others / HALF_RANGE + 1)), to_bytes(QUAT_TAG + largest)
 
 
 def _rest(rest: Float[np.ndarray, "n k 3"]) -> tuple[Images, dict[str, Any]]:
@@ -197,13 +186,7 @@ class Codebook(NamedTuple):
 
 
 def codebook(values: Float[np.ndarray, "*n"]) -> Codebook:
-    """Find 256 codes that values can be rounded to with a small squared error.
-
-    This is one-dimensional k-means (Lloyd 1982) on the sorted values. The density of the initial
-    codes follows the cube root of that of the values (Panter and Dite 1951). Up to 256 distinct
-    values are kept. A few outliers do not coarsen the others. Memory: two copies of the values in
-    float64.
-    """
+    """Find 256 codes to round values to, by one-dimensional k-means (Lloyd 1982)."""
     ordered = np.sort(values, axis=None).astype(np.float64)
     codes = _first_codes(ordered)
     for _ in range(_ITERATIONS):
@@ -219,10 +202,11 @@ def codebook(values: Float[np.ndarray, "*n"]) -> Codebook:
 
 
 def _first_codes(ordered: Float[np.ndarray, "n"]) -> Float[np.ndarray, "256"]:
+    """Return codes as dense as the cube root of the values' density (Panter and Dite 1951)."""
     different = np.flatnonzero(np.diff(ordered, prepend=-np.inf))
-    if len(different) <= CODES:
+    if len(different) <= _CODES:
         few: Float[np.ndarray, 256] = ordered[different]
-        return np.pad(few, (0, CODES - len(few)), "edge")
+        return np.pad(few, (0, _CODES - len(few)), "edge")
     count = min(len(ordered), _KNOTS)
     knots = ordered[np.linspace(0, len(ordered) - 1, count).round().astype(np.int64)]
     steps = np.diff(knots) ** (2 / 3)
@@ -230,7 +214,7 @@ def _first_codes(ordered: Float[np.ndarray, "n"]) -> Float[np.ndarray, "256"]:
     if usual > 0:
         steps = np.minimum(steps, _WIDEST_GAP * usual)
     passed = np.concatenate([[0.0], np.cumsum(steps)])
-    codes: Float[np.ndarray, 256] = np.interp(np.linspace(0, passed[-1], CODES), passed, knots)
+    codes: Float[np.ndarray, 256] = np.interp(np.linspace(0, passed[-1], _CODES), passed, knots)
     return codes
 
 
@@ -242,21 +226,14 @@ class Palette(NamedTuple):
 
 
 def palette_size(count: int) -> int:
-    """Return the palette size: a power of 2, at least half of the rows but at most 65,536.
-
-    This follows splat-transform. A palette of all rows would be most of the file of a small scene:
-    452 of 668 kB for 15,000 Gaussians.
-    """
-    return min(PALETTE, 1 << max(10, count.bit_length() - 1))
+    """Return the palette size: as in splat-transform, at least half of the rows."""
+    return min(_PALETTE, 1 << max(10, count.bit_length() - 1))
 
 
 def palette(rows: Float[np.ndarray, "n d"], most: int | None = None) -> Palette:
-    """Find a palette of a few rows that replaces many rows.
+    """Find the means of groups of rows that replace many rows; memory is three copies of the rows.
 
-    Up to ``most`` rows are kept. More rows are grouped: the half of the groups with the largest
-    squared errors is split, each at the mean of the column of largest variance (after Wu 1991, but
-    many groups at once), until there are ``most`` groups. Entries are group means. A million rows
-    take seconds; k-means would take an hour on a CPU. Memory: three copies of the rows.
+    Groups of large errors are split (after Wu 1991, but many at once), far faster than k-means.
     """
     most = palette_size(len(rows)) if most is None else most
     if len(rows) <= most:
@@ -282,7 +259,7 @@ def palette(rows: Float[np.ndarray, "n d"], most: int | None = None) -> Palette:
 def _split(
     rows: Tensor, squares: Tensor, order: Tensor, starts: Tensor, *, most: int
 ) -> tuple[Tensor, Tensor]:
-    """Split the half of the groups with the largest errors; return the new order and starts."""
+    """Split the half of the groups with the largest errors, each at the mean of a column."""
     means, mean_squares = _group_means(rows, order, starts), _group_means(squares, order, starts)
     variances = mean_squares - means.square()
     variances = torch.where(variances > _RELATIVE_ROUNDING * mean_squares, variances, 0.0)
