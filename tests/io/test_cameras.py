@@ -142,8 +142,8 @@ def test_blender_scenes_have_one_file_per_split_and_png_sizes(tmp_path) -> None:
     with pytest.raises(InvalidArgumentError) as error:
         load_cameras(tmp_path / "transforms_test.json", split="train")
     assert str(error.value) == (
-        f"{tmp_path / 'transforms_test.json'}: the split must be 'test' for this file, "
-        f"found 'train'; pass the folder to read both splits."
+        f"{tmp_path / 'transforms_test.json'}: the split of this file must be 'test', found "
+        f"'train'; give the folder."
     )
 
 

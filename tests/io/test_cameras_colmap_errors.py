@@ -35,7 +35,7 @@ CAMERAS_TXT: Mapping[str, tuple[str, str]] = {
     "fisheye": (
         "1 OPENCV_FISHEYE 64 48 9 9 9 9 0 0 0 0",
         "the camera model must be one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, "
-        "FULL_OPENCV, found OPENCV_FISHEYE; undistort the images first (colmap image_undistorter).",
+        "FULL_OPENCV, found OPENCV_FISHEYE; use colmap image_undistorter first.",
     ),
     "infinite": (
         "1 PINHOLE 64 48 9 inf 9 9",
@@ -66,12 +66,13 @@ def test_damage_of_cameras_txt_is_one_sentence(case, tmp_path) -> None:
 IMAGES_TXT: Mapping[str, tuple[str, str]] = {
     "few words": (
         "1 1 0 0 0 0 0 1 7",
-        "line 2: must be an image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, "
-        "found '1 1 0 0 0 0 0 1 7'.",
+        "line 2: must be an image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, numeric but for "
+        "the name, found '1 1 0 0 0 0 0 1 7'.",
     ),
     "no number": (
         "1 1 0 0 0 0 0 x 7 a.jpg",
-        "line 2: must be an image with numeric fields, found '1 1 0 0 0 0 0 x 7 a.jpg'.",
+        "line 2: must be an image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, numeric but for "
+        "the name, found '1 1 0 0 0 0 0 x 7 a.jpg'.",
     ),
     "zero quaternion": (
         "1 0 0 0 0 0 0 5 7 a.jpg",
@@ -93,7 +94,7 @@ IMAGES_TXT: Mapping[str, tuple[str, str]] = {
     ),
     "unknown camera": (
         "1 1 0 0 0 0 0 5 8 a.jpg",
-        "image 'a.jpg' must refer to a camera in the camera file, found camera 8.",
+        "the camera of 'a.jpg' must exist, found 8.",
     ),
 }
 
@@ -123,28 +124,26 @@ def packed_image(
 BINARY: Mapping[str, tuple[str, bytes, str]] = {
     "empty": (
         "cameras", b"",
-        "the file is cut short: the count of cameras must have 8 bytes, found 0.",
+        "the file is cut short: the count of cameras needs 8 bytes, found 0.",
     ),
     "lying count of cameras": (
         "cameras", packed_cameras(count=1 << 60),
-        "the file is cut short: 1,152,921,504,606,846,976 cameras must have "
+        "the file is cut short: 1,152,921,504,606,846,976 cameras needs "
         "27,670,116,110,564,327,424 bytes, found 56.",
     ),
     "cut camera": (
         "cameras", packed_cameras()[:-1],
-        "the file is cut short: camera 0 must have 32 bytes, found 31.",
+        "the file is cut short: camera 0 needs 32 bytes, found 31.",
     ),
     "fisheye": (
         "cameras", packed_cameras(model=5),
         "camera 0: the camera model must be one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, "
-        "OPENCV, FULL_OPENCV, found OPENCV_FISHEYE; undistort the images first "
-        "(colmap image_undistorter).",
+        "OPENCV, FULL_OPENCV, found OPENCV_FISHEYE; use colmap image_undistorter first.",
     ),
     "unknown model": (
         "cameras", packed_cameras(model=99),
         "camera 0: the camera model must be one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, "
-        "OPENCV, FULL_OPENCV, found number 99; undistort the images first "
-        "(colmap image_undistorter).",
+        "OPENCV, FULL_OPENCV, found number 99; use colmap image_undistorter first.",
     ),
     "width": (
         "cameras", packed_cameras(width=1 << 63),
@@ -153,11 +152,11 @@ BINARY: Mapping[str, tuple[str, bytes, str]] = {
     ),
     "lying count of images": (
         "images", packed_image(count=9),
-        "the file is cut short: 9 images must have 657 bytes, found 78.",
+        "the file is cut short: 9 images needs 657 bytes, found 78.",
     ),
     "lying count of points": (
         "images", packed_image(points=(1 << 64) - 1),
-        "the file is cut short: 18,446,744,073,709,551,615 points of image 0 must have "
+        "the file is cut short: 18,446,744,073,709,551,615 points of image 0 needs "
         "442,721,857,769,029,238,760 bytes, found 0.",
     ),
     "endless name": (
@@ -203,9 +202,9 @@ def test_random_damage_gives_cameras_or_a_format_error(name, tmp_path) -> None:
 
 def test_missing_files_are_one_sentence(tmp_path) -> None:
     assert camera_refusal(tmp_path, InputNotFoundError) == (
-        f"{tmp_path}: the folder must hold transforms.json, transforms_train.json, "
+        f"{tmp_path}: must hold transforms.json, transforms_train.json, "
         f"transforms_test.json, a COLMAP model (in sparse/0, sparse or the folder itself) "
-        f"or cameras.json; found none of them."
+        f"or cameras.json, found none."
     )
     for name in ("no.json", "no"):
         assert camera_refusal(tmp_path / name, InputNotFoundError) == (

@@ -141,8 +141,7 @@ def test_impossible_splits_are_refused(tmp_path) -> None:
     document = {**transforms(), "train_filenames": ["images/frame_01.jpg", "images/none.jpg"]}
     path = write_json(tmp_path / "transforms.json", document)
     assert camera_refusal(path, split="train") == (
-        f"{path}: row 1 of 'train_filenames' must be the 'file_path' of a frame, "
-        f"found 'images/none.jpg'."
+        f"{path}: train_filenames[1] must name a frame, found 'images/none.jpg'."
     )
     assert (
         camera_refusal(path, split="test")
@@ -178,8 +177,7 @@ def test_missing_image_sizes_are_one_sentence(tmp_path) -> None:
     for content in (b"\xff\xd8\xff" + bytes(100), b"\x89PNG"):
         (tmp_path / "r_0.png").write_bytes(content)
         assert camera_refusal(path) == (
-            f"{tmp_path / 'r_0.png'}: must be a PNG file, since the cameras do not give its size, "
-            f"found another format; add 'w' and 'h' to the camera file."
+            f"{tmp_path / 'r_0.png'}: must be a PNG unless 'w' and 'h' are given, found another."
         )
 
 

@@ -24,10 +24,8 @@ from cvtgs.io.files import is_file, is_folder, read_json
 
 MAX_PIXELS = 1 << 20  # largest width and height of images; a larger number is considered damaged
 MAX_AREA = 1 << 28  # largest number of pixels of an image, for which rendering takes some gigabytes
-
 _SKEW = 0.01
 _TEST_EVERY = 8
-
 _COLMAP_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 
 Split = Literal["train", "test"]
@@ -107,30 +105,6 @@ def hold_out(views: Sequence[View], split: Split | None) -> list[View]:
     return [view for row, view in enumerate(views) if (row in test) == (split == "test")]
 
 
-def to_cameras(views: Sequence[View], path: str) -> Cameras:
-    """Build cameras of the most frequent image size, and warn once about distortion."""
-    sizes = Counter((view.lens.width, view.lens.height) for view in views)
-    (width, height), _ = sizes.most_common(1)[0]
-    distorted = sum(view.lens.distorted for view in views)
-    if distorted:
-        warn(
-            f"{path}: left out the lens distortion of {distorted:,} of {len(views):,} cameras, "
-            f"since rendering uses pinhole cameras; compare with undistorted photographs.",
-            DroppedDataWarning,
-        )
-    intrinsics = []
-    for lens in (view.lens for view in views):
-        x, y = width / lens.width, height / lens.height
-        intrinsics.append([[lens.fx * x, 0, lens.cx * x], [0, lens.fy * y, lens.cy * y], [0, 0, 1]])
-    return Cameras(
-        viewmats=torch.from_numpy(np.stack([view.viewmat for view in views])),
-        Ks=torch.from_numpy(np.array(intrinsics, np.float64)),
-        width=width,
-        height=height,
-        names=tuple(view.name for view in views),
-    )
-
-
 def load_cameras(path: str | os.PathLike[str], *, split: Split | None = None) -> Cameras:
     """Read the cameras of a capture.
 
@@ -188,7 +162,26 @@ def load_cameras(path: str | os.PathLike[str], *, split: Split | None = None) ->
         raise FileFormatError(
             f"{source}: must hold at least one {f'{split} ' if split else ''}camera, found none."
         )
-    return to_cameras(views, str(source))
+    sizes = Counter((view.lens.width, view.lens.height) for view in views)
+    (width, height), _ = sizes.most_common(1)[0]
+    distorted = sum(view.lens.distorted for view in views)
+    if distorted:
+        warn(
+            f"{source}: left out the lens distortion of {distorted:,} of {len(views):,} cameras, "
+            f"since rendering uses pinhole cameras; compare with undistorted photographs.",
+            DroppedDataWarning,
+        )
+    intrinsics = []
+    for lens in (view.lens for view in views):
+        x, y = width / lens.width, height / lens.height
+        intrinsics.append([[lens.fx * x, 0, lens.cx * x], [0, lens.fy * y, lens.cy * y], [0, 0, 1]])
+    return Cameras(
+        viewmats=torch.from_numpy(np.stack([view.viewmat for view in views])),
+        Ks=torch.from_numpy(np.array(intrinsics, np.float64)),
+        width=width,
+        height=height,
+        names=tuple(view.name for view in views),
+    )
 
 
 def _folder_views(folder: Path, split: Split | None) -> list[View]:
@@ -207,9 +200,8 @@ def _folder_views(folder: Path, split: Split | None) -> list[View]:
     if is_file(folder / "cameras.json"):
         return _file_views(folder / "cameras.json", split)
     raise InputNotFoundError(
-        f"{folder}: the folder must hold transforms.json, transforms_train.json, "
-        f"transforms_test.json, a COLMAP model (in sparse/0, sparse or the folder itself) or "
-        f"cameras.json; found none of them."
+        f"{folder}: must hold transforms.json, transforms_train.json, transforms_test.json, a "
+        f"COLMAP model (in sparse/0, sparse or the folder itself) or cameras.json, found none."
     )
 
 

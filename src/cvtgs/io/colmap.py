@@ -37,27 +37,22 @@ class _Image(NamedTuple):
 class _Model(NamedTuple):
     """A COLMAP camera model that a pinhole camera can replace."""
 
-    number: int  # in binary files
     parameters: int
     focals: int  # how many of the parameters are focal lengths
 
 
 _MODELS: Mapping[str, _Model] = {
-    "SIMPLE_PINHOLE": _Model(number=0, parameters=3, focals=1),
-    "PINHOLE": _Model(number=1, parameters=4, focals=2),
-    "SIMPLE_RADIAL": _Model(number=2, parameters=4, focals=1),
-    "RADIAL": _Model(number=3, parameters=5, focals=1),
-    "OPENCV": _Model(number=4, parameters=8, focals=2),
-    "FULL_OPENCV": _Model(number=6, parameters=12, focals=2),
+    "SIMPLE_PINHOLE": _Model(parameters=3, focals=1),
+    "PINHOLE": _Model(parameters=4, focals=2),
+    "SIMPLE_RADIAL": _Model(parameters=4, focals=1),
+    "RADIAL": _Model(parameters=5, focals=1),
+    "OPENCV": _Model(parameters=8, focals=2),
+    "FULL_OPENCV": _Model(parameters=12, focals=2),
 }
-
-_NAMES = {model.number: name for name, model in _MODELS.items()} | {
-    5: "OPENCV_FISHEYE",
-    7: "FOV",
-    8: "SIMPLE_RADIAL_FISHEYE",
-    9: "RADIAL_FISHEYE",
-    10: "THIN_PRISM_FISHEYE",
-}
+_NAMES = (  # of all models, by their numbers in binary files
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"),
+    *("FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
+)
 
 
 def is_colmap(folder: Path) -> bool:
@@ -77,8 +72,7 @@ def colmap_views(folder: Path, *, as_text: bool = False) -> list[View]:
     for image in images:
         if image.camera not in lenses:
             raise FileFormatError(
-                f"{path}: image {shown(image.name)} must refer to a camera in the camera file, "
-                f"found camera {image.camera}."
+                f"{path}: the camera of {shown(image.name)} must exist, found {image.camera}."
             )
     poses = np.array([image.pose for image in images], np.float64).reshape(-1, 7)
     viewmats = np.tile(np.eye(4), (len(images), 1, 1))
@@ -106,8 +100,7 @@ def _find_model(name: str, where: str) -> _Model:
     if name not in _MODELS:
         raise FileFormatError(
             f"{where}: the camera model must be one of {', '.join(_MODELS)}, found "
-            f"{shortened(printable(name), MOST_LETTERS)}; "
-            f"undistort the images first (colmap image_undistorter)."
+            f"{shortened(printable(name), MOST_LETTERS)}; use colmap image_undistorter first."
         )
     return _MODELS[name]
 
@@ -157,8 +150,7 @@ class _Bytes:
         left = os.fstat(self.file.fileno()).st_size - self.file.tell()
         if size > left:
             raise FileFormatError(
-                f"{self.path}: the file is cut short: {what} must have {size:,} bytes, "
-                f"found {left:,}."
+                f"{self.path}: the file is cut short: {what} needs {size:,} bytes, found {left:,}."
             )
 
 
@@ -169,7 +161,8 @@ def _cameras_of_bin(path: Path) -> dict[int, Lens]:
         for row in range(data.count("cameras", least=_CAMERA.size)):
             camera, number, width, height = data.take(_CAMERA, f"camera {row}")
             where = f"{path}: camera {row}"
-            model = _find_model(_NAMES.get(number, f"number {number}"), where)
+            is_known = 0 <= number < len(_NAMES)
+            model = _find_model(_NAMES[number] if is_known else f"number {number}", where)
             layout = struct.Struct(f"<{model.parameters}d")
             parameters = data.take(layout, f"camera {row}")
             lenses[camera] = _lens_of(model, parameters, width=width, height=height, where=where)
@@ -194,21 +187,20 @@ def _cameras_of_txt(path: Path) -> dict[int, Lens]:
     """Read ``cameras.txt``: each line has number, model, width, height and parameters."""
     lenses: dict[int, Lens] = {}
     with open_input(path) as file:
-        for number, line in _lines(file):
-            where = f"{path}: line {number}"
+        for where, line in _lines(file, path):
             if not line or line.startswith("#"):
                 continue
             words = line.split()
             if len(words) < 4:
                 raise _wrong(where, "a camera: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line)
             model = _find_model(words[1], where)
-            if len(words) != 4 + model.parameters:
-                raise _wrong(where, f"a {words[1]} camera with {model.parameters} parameters", line)
             try:
                 camera, width, height = int(words[0]), int(words[2]), int(words[3])
                 parameters = [float(word) for word in words[4:]]
             except ValueError as error:
                 raise _wrong(where, "a camera with numeric fields", line) from error
+            if len(parameters) != model.parameters:
+                raise _wrong(where, f"a {words[1]} camera with {model.parameters} parameters", line)
             lenses[camera] = _lens_of(model, parameters, width=width, height=height, where=where)
     return lenses
 
@@ -217,38 +209,30 @@ def _images_of_txt(path: Path) -> list[_Image]:
     """Read ``images.txt``: a line of number, pose, camera and name, then a line of points."""
     images: list[_Image] = []
     with open_input(path) as file:
-        lines = _lines(file)
-        for number, line in lines:
+        lines = _lines(file, path)
+        for where, line in lines:
             if not line or line.startswith("#"):
                 continue
-            images.append(_image_of_line(line, f"{path}: line {number}"))
-            number_of_points, points = next(lines, (number + 1, ""))
+            words = line.split(maxsplit=9)  # names may have blanks
+            try:
+                pose, camera, name = [float(word) for word in words[1:8]], int(words[8]), words[9]
+            except (ValueError, IndexError) as error:
+                required = "an image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+                raise _wrong(where, f"{required}, numeric but for the name", line) from error
+            images.append(_checked_image(name, camera, pose=pose, where=where))
+            place, points = next(lines, (where, ""))
             words = points.split()
             if len(words) % 3 or not all(word.lstrip("-").isdecimal() for word in words[2::3]):
-                raise _wrong(
-                    f"{path}: line {number_of_points}",
-                    f"the points of image {shown(images[-1].name)} as X Y POINT3D_ID, or empty",
-                    points,
-                )
+                required = f"the points of image {shown(name)} as X Y POINT3D_ID, or empty"
+                raise _wrong(place, required, points)
     return images
 
 
-def _image_of_line(line: str, where: str) -> _Image:
-    words = line.split(maxsplit=9)  # names may have blanks
-    if len(words) != 10:
-        raise _wrong(where, "an image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line)
-    try:
-        pose = [float(word) for word in words[1:8]]
-        camera = int(words[8])
-    except ValueError as error:
-        raise _wrong(where, "an image with numeric fields", line) from error
-    return _checked_image(words[9], camera, pose=pose, where=where)
-
-
-def _lines(file: BinaryIO) -> Iterator[tuple[int, str]]:
+def _lines(file: BinaryIO, path: Path) -> Iterator[tuple[str, str]]:
+    """Yield the lines and their places for errors."""
     for number, line in enumerate(file, start=1):
         text = line.removeprefix(codecs.BOM_UTF8) if number == 1 else line
-        yield number, _text_of(text).strip()
+        yield f"{path}: line {number}", _text_of(text).strip()
 
 
 def _text_of(content: bytes) -> str:

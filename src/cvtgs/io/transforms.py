@@ -95,9 +95,9 @@ def inria_views(entries: Sequence[Any], path: Path) -> list[View]:
     for row, entry in enumerate(entries):
         where = f"{path}: camera {row}"
         camera = validated(_InriaCamera, entry, where)
-        size = {"width": camera.width, "height": camera.height}
-        cx, cy = camera.width / 2, camera.height / 2
-        lens = Lens(fx=camera.fx, fy=camera.fy, cx=cx, cy=cy, **size)
+        width, height = camera.width, camera.height
+        cx, cy = width / 2, height / 2
+        lens = Lens(fx=camera.fx, fy=camera.fy, cx=cx, cy=cy, width=width, height=height)
         rotation, position = np.array(camera.rotation), np.array(camera.position)
         viewmat = viewmat_of_pose(rotation, position, where=where)
         views.append(View(name=camera.img_name, viewmat=viewmat, lens=checked_lens(lens, where)))
@@ -117,8 +117,7 @@ def transforms_views(content: Any, path: Path, split: Split | None) -> list[View
     if own in SPLITS:
         if own != split:
             raise InvalidArgumentError(
-                f"{path}: the split must be {own!r} for this file, found {split!r}; "
-                f"pass the folder to read both splits."
+                f"{path}: the split of this file must be {own!r}, found {split!r}; give the folder."
             )
         return views
     lists = (document.train_filenames, document.val_filenames, document.test_filenames)
@@ -188,24 +187,20 @@ def _size(frame: _Frame, *, path: Path, where: str) -> tuple[int, int]:
         return frame.w, frame.h
     image = path.parent / frame.file_path.replace("\\", "/")  # of Windows
     for candidate in (image, Path(f"{image}.png")):
-        if is_file(candidate):
-            return _png_size(candidate)
+        if not is_file(candidate):
+            continue
+        with open_input(candidate) as file:
+            start = file.read(_PNG_START.size)
+        if len(start) == _PNG_START.size:
+            signature, _, chunk, width, height = _PNG_START.unpack(start)
+            if signature == _PNG_SIGNATURE and chunk == b"IHDR":
+                return width, height
+        raise FileFormatError(
+            f"{candidate}: must be a PNG unless 'w' and 'h' are given, found another."
+        )
     raise FileFormatError(
         f"{where}: 'w' and 'h' must be given in the frame or at the top level of the file, or the "
         f"image must exist; found neither them nor an image {shown(frame.file_path)}."
-    )
-
-
-def _png_size(path: Path) -> tuple[int, int]:
-    with open_input(path) as file:
-        start = file.read(_PNG_START.size)
-    if len(start) == _PNG_START.size:
-        signature, _, chunk, width, height = _PNG_START.unpack(start)
-        if signature == _PNG_SIGNATURE and chunk == b"IHDR":
-            return width, height
-    raise FileFormatError(
-        f"{path}: must be a PNG file, since the cameras do not give its size, found another "
-        f"format; add 'w' and 'h' to the camera file."
     )
 
 
@@ -214,12 +209,8 @@ def _listed(views: Sequence[View], names: Sequence[Any] | None, key: str, path: 
     if names is None:
         raise FileFormatError(f"{path}: {key!r} must be a list, found none.")
     known = {PurePosixPath(view.name) for view in views}
-    wanted = set()
     for row, name in enumerate(names):
         if not isinstance(name, str) or PurePosixPath(name) not in known:
-            raise FileFormatError(
-                f"{path}: row {row} of {key!r} must be the 'file_path' of a frame, found "
-                f"{shown(name)}."
-            )
-        wanted.add(PurePosixPath(name))
+            raise FileFormatError(f"{path}: {key}[{row}] must name a frame, found {shown(name)}.")
+    wanted = set(map(PurePosixPath, names))
     return [view for view in views if PurePosixPath(view.name) in wanted]
