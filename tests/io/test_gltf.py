@@ -246,9 +246,7 @@ def test_buffers_are_read_from_the_folder_of_the_file_only(small: Path, tmp_path
     for uri in (*outside, "C%3A/x.bin"):  # on Windows, a file on another drive
         document["buffers"][0]["uri"] = uri
         path.write_text(json.dumps(document))
-        assert refusal(path) == (
-            f"{path}: buffers[0] must be in the folder of the file, found {uri!r}."
-        )
+        assert refusal(path) == (f"{path}: buffers[0] must be in the file's folder, found {uri!r}.")
     document["buffers"][0]["uri"] = "dat;base64," + "A" * 1000
     path.write_text(json.dumps(document))
     assert len(str(refusal(path))) < 120 + len(str(path))

@@ -133,7 +133,7 @@ def test_lod_is_refused_for_other_files_and_out_of_range(stream: Path, tmp_path:
     save(storable_scene(3), tmp_path / "a.ply")
     assert len(load(tmp_path / "a.ply", lod=0)) == 3
     for other in (1, "0"):
-        with pytest.raises(InvalidArgumentError, match=r"0 unless for a streamed SOG \(lod"):
+        with pytest.raises(InvalidArgumentError, match=r"0 unless for a streamed SOG, found"):
             load(tmp_path / "a.ply", lod=cast("Any", other))
     wrongs: tuple[Any, ...] = (-1, 2, 0.5, "1", True)
     for lod in wrongs:
@@ -181,7 +181,7 @@ DAMAGE: dict[str, tuple[Change, str]] = {
     ),
     "file": (
         lambda d: rows(d).update(file=9),
-        "filenames has 3 entries, found a reference to 9.",
+        "filenames has 3 entries, found number 9.",
     ),
     "sum": (
         lambda d: d.update(counts=[9, 5]),
@@ -235,15 +235,13 @@ def test_missing_and_short_files_are_refused(stream: Path) -> None:
     path = stream / "0_1" / "meta.json"
     assert refusal(stream) == f"{path}: the file to read must exist, found none."
     write_folder(storable_scene(2, degree=1), stream / "0_1")
-    assert refusal(stream) == (
-        f"{path}: must have the 4 Gaussians that the stream reads from it, found 2."
-    )
+    assert refusal(stream) == (f"{path}: the stream needs 4 Gaussians, found 2.")
 
 
 def test_a_file_too_short_for_its_last_chunk_is_refused(stream: Path) -> None:
     shutil.rmtree(stream / "1_0")
     write_folder(storable_scene(4, degree=1), stream / "1_0")
-    with pytest.raises(FileFormatError, match=r"must have the 5 Gaussians that the .*, found 4"):
+    with pytest.raises(FileFormatError, match=r"the stream needs 5 Gaussians, found 4"):
         load(stream, lod=1)
 
 

@@ -147,7 +147,6 @@ def test_a_scene_without_finite_gaussians_is_not_written(tmp_path: Path) -> None
     with pytest.warns(DroppedDataWarning), pytest.raises(InvalidSceneError) as caught:
         save(scene, tmp_path / "a.splat")
     assert str(caught.value) == (
-        "a scene must hold at least one Gaussian with finite values to be written, found none "
-        "among 2 Gaussians."
+        "a scene to write must hold a Gaussian with finite values, found 0 of 2."
     )
     assert list(tmp_path.iterdir()) == []

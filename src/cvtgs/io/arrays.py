@@ -1,13 +1,12 @@
 """Scenes as numpy arrays, and the conversions of parameters that compact formats share."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
-from torch import Tensor
 
 from cvtgs.errors import InvalidSceneError
 from cvtgs.io.limits import SCALE_RANGE
@@ -21,7 +20,6 @@ Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-
 HALF_RANGE = np.float32(np.sqrt(0.5))  # bounds the three smaller components of a unit quaternion
 
 
@@ -37,44 +35,35 @@ class Arrays:
     shN: Float[np.ndarray, "n k 3"]  # noqa: N815 (the name that scenes give it)
 
 
+ARRAY_NAMES = tuple(field.name for field in fields(Arrays))
+
+
 def arrays_of(scene: GaussianScene, *, sh_degree: int = 3) -> Arrays:
     """Return the rows of a scene that a compact format can hold."""
     rows = writable_rows(scene)
     if not bool(rows.any()):
         raise InvalidSceneError(
-            f"a scene must hold at least one Gaussian with finite values to be written, "
-            f"found none among {len(scene):,} Gaussians."
+            f"a scene to write must hold a Gaussian with finite values, found 0 of {len(scene):,}."
         )
     whole = bool(rows.all())
     own = {
         name: (tensor if whole else tensor[rows]).detach().cpu().float().numpy()
         for name, tensor in scene.tensors().items()
     }
-    return Arrays(
-        means=own["means"],
-        quats=unit_quats(own["quats"]),
-        log_scales=own["log_scales"],
-        logit_opacities=own["logit_opacities"],
-        sh0=own["sh0"][:, 0],
-        shN=own["shN"][:, : REST_COUNTS[sh_degree]],
-    )
+    own["quats"] = unit_quats(own["quats"])
+    own["sh0"] = own["sh0"][:, 0]
+    own["shN"] = own["shN"][:, : REST_COUNTS[sh_degree]]
+    return Arrays(**own)
 
 
 def scene_of(arrays: Arrays, *, comments: Sequence[str] = ()) -> GaussianScene:
     """Build a scene."""
-
-    def tensor(values: Floats) -> Tensor:
-        return torch.from_numpy(np.require(values, np.float32, ["C", "W"]))
-
-    return GaussianScene(
-        means=tensor(arrays.means),
-        quats=tensor(arrays.quats),
-        log_scales=tensor(arrays.log_scales),
-        logit_opacities=tensor(arrays.logit_opacities),
-        sh0=tensor(arrays.sh0)[:, None, :],
-        shN=tensor(arrays.shN),
-        comments=tuple(comments),
-    )
+    tensors = {}
+    for name in ARRAY_NAMES:
+        values = np.require(getattr(arrays, name), np.float32, ["C", "W"])
+        tensors[name] = torch.from_numpy(values)
+    tensors["sh0"] = tensors["sh0"][:, None, :]
+    return GaussianScene(**tensors, extras={}, comments=tuple(comments), layout=())
 
 
 def unit_quats(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
@@ -90,21 +79,18 @@ def unit_quats(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
 
 def to_bytes(values: Float[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
     """Round to the nearest integer from 0 to 255."""
-    whole: Bytes = np.clip(np.rint(values), 0, 255).astype(np.uint8)
-    return whole
+    return np.asarray(np.clip(np.rint(values), 0, 255), np.uint8)
 
 
 def log_scales_of(scales: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Return the logarithms of scales; those below the smallest float32 count as that."""
     with np.errstate(invalid="ignore"):  # of NaN; rows are checked later
-        logs: Floats = np.log(np.maximum(scales, np.finfo(np.float32).tiny))
-        return logs
+        return np.asarray(np.log(np.maximum(scales, np.finfo(np.float32).tiny)))
 
 
 def scales_of(log_scales: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Return the scales of clamped logarithms, as formats with scales store them."""
-    scales: Floats = np.exp(np.clip(log_scales, *SCALE_RANGE))
-    return scales
+    return np.asarray(np.exp(np.clip(log_scales, *SCALE_RANGE)))
 
 
 def opacities_of(logits: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
@@ -174,5 +160,4 @@ def morton_rows(means: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
     """Return the order along a Morton curve; distant Gaussians do not coarsen it."""
     away = in_radii(means)
     shrunk = np.sign(away) * np.log1p(np.abs(away))
-    order: Int[np.ndarray, n] = morton_order(torch.from_numpy(shrunk)).numpy()
-    return order
+    return morton_order(torch.from_numpy(shrunk)).numpy()

@@ -25,7 +25,7 @@ from cvtgs.io.arrays import (
 )
 from cvtgs.io.files import open_input
 from cvtgs.io.limits import FORMAT_LIMITS
-from cvtgs.io.ply.header import Element, Header, check_size, header_bytes, read_header, row_dtype
+from cvtgs.io.ply.header import Header, check_size, header_bytes, read_header, row_dtype
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 
@@ -45,18 +45,11 @@ _UNCOLORED = 12
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of a vertex
 _THREE_BITS = (11, 10, 11)  # bits of positions and scales
 _COLOR_BITS = (8, 8, 8)  # bits of red, green and blue; the last 8 are those of the opacity
-
 _QUAT_BITS = (10, 10, 10)  # of the smaller components; the top two bits index the missing one
 
 
 def read_compressed_ply(path: Path) -> GaussianScene:
     """Read a compressed PLY file, as PlayCanvas' tools write it.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The scene, with the comments of the file.
 
     Raises:
         InputError: The file does not exist, or cannot be opened or read.
@@ -98,8 +91,7 @@ def _between(
     ranges: Float[np.ndarray, "c 6"], fractions: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     own = np.repeat(ranges, _CHUNK_ROWS, axis=0)[: len(fractions)]
-    values: Float[np.ndarray, "n 3"] = own[:, :3] * (1 - fractions) + own[:, 3:] * fractions
-    return values
+    return np.asarray(own[:, :3] * (1 - fractions) + own[:, 3:] * fractions)
 
 
 def _ranges(chunks: Rows) -> Float[np.ndarray, "c 18"]:
@@ -149,18 +141,16 @@ def _check(header: Header, path: Path) -> None:
             f"{path}: must hold at least one vertex and a chunk for every {_CHUNK_ROWS} of them, "
             f"found {vertices:,} vertices and {chunks:,} chunks."
         )
-    if "sh" in found and found["sh"].properties:  # gsplat writes an empty one at SH degree 0
-        _check_rest(found["sh"], vertices, path)
-
-
-def _check_rest(table: Element, vertices: int, path: Path) -> None:
-    names = {prop.name for prop in table.properties if prop.type == "uchar"}
-    counts = [3 * count for count in REST_COUNTS[1:]]
-    wanted = {f"f_rest_{i}" for i in range(len(table.properties))}
-    if names != wanted or len(names) not in counts or table.count != vertices:
+    rest = found.get("sh")
+    if rest is None or not rest.properties:  # gsplat writes an empty one at SH degree 0
+        return
+    names = {prop.name for prop in rest.properties if prop.type == "uchar"}
+    own = {f"f_rest_{i}" for i in range(len(rest.properties))}
+    counts = [3 * count for count in REST_COUNTS]
+    if names != own or len(names) not in counts or rest.count != vertices:
         raise FileFormatError(
             f"{path}: element 'sh' must have 9, 24 or 45 uchar properties f_rest_0, f_rest_1, ... "
-            f"for each of {vertices:,} vertices, found {len(names)} for {table.count:,}."
+            f"for each of {vertices:,} vertices, found {len(names)} for {rest.count:,}."
         )
 
 
@@ -181,9 +171,21 @@ def write_compressed_ply(scene: GaussianScene, file: BinaryIO) -> None:
         names = (f"f_rest_{i}" for i in range(rest.shape[1]))
         elements.append(("sh", len(order), tuple((name, "uchar") for name in names)))
     file.write(header_bytes(scene.comments, elements))
-    ranges, words = _packed(arrays, order)
+    log_scales = np.clip(arrays.log_scales, *FORMAT_LIMITS[".compressed.ply"].ranges["log_scales"])
+    opacities = opacity_bytes(arrays.logit_opacities)[order].astype(np.uint32)
+    place, place_range = _fractions(arrays.means[order])
+    scale, scale_range = _fractions(log_scales[order])
+    color, color_range = _fractions(colors_of_sh0(arrays.sh0[order]))
+    largest, others = drop_largest(arrays.quats[order])
+    words = [
+        _pack(place, _THREE_BITS),
+        largest.astype(np.uint32) << np.uint32(30) | _pack(others * HALF_RANGE + 0.5, _QUAT_BITS),
+        _pack(scale, _THREE_BITS),
+        _pack(color, _COLOR_BITS) << np.uint32(8) | opacities,
+    ]
+    ranges = np.concatenate([place_range, scale_range, color_range], axis=1)
     file.write(ranges.astype("<f4").tobytes())
-    file.write(words.astype("<u4").tobytes())
+    file.write(np.stack(words, axis=1).astype("<u4").tobytes())
     steps = np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255)
     file.write(steps.astype(np.uint8).tobytes())
 
@@ -205,25 +207,6 @@ def _flyaways_last(arrays: Arrays, order: NDArray[np.int64]) -> NDArray[np.int64
     last[np.argsort(visible, kind="stable")[:others]] = True
     faint, far = (last & ~far)[order], far[order]
     return np.concatenate([order[~last[order]], order[faint], order[far]])
-
-
-def _packed(
-    arrays: Arrays, order: NDArray[np.int64]
-) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Return the ranges of each chunk and the words of each Gaussian."""
-    log_scales = np.clip(arrays.log_scales, *FORMAT_LIMITS[".compressed.ply"].ranges["log_scales"])
-    opacities = opacity_bytes(arrays.logit_opacities)[order].astype(np.uint32)
-    place, place_range = _fractions(arrays.means[order])
-    scale, scale_range = _fractions(log_scales[order])
-    color, color_range = _fractions(colors_of_sh0(arrays.sh0[order]))
-    largest, others = drop_largest(arrays.quats[order])
-    words = [
-        _pack(place, _THREE_BITS),
-        largest.astype(np.uint32) << np.uint32(30) | _pack(others * HALF_RANGE + 0.5, _QUAT_BITS),
-        _pack(scale, _THREE_BITS),
-        _pack(color, _COLOR_BITS) << np.uint32(8) | opacities,
-    ]
-    return np.concatenate([place_range, scale_range, color_range], axis=1), np.stack(words, axis=1)
 
 
 def _fractions(

@@ -1,6 +1,5 @@
 """The ``.splat`` files of antimatter15's viewer and the ``.ksplat`` files of mkkellogg's."""
 
-import dataclasses
 import os
 import struct
 from itertools import pairwise
@@ -12,6 +11,7 @@ from jaxtyping import Float, Int
 
 from cvtgs.errors import FileFormatError
 from cvtgs.io.arrays import (
+    ARRAY_NAMES,
     Arrays,
     arrays_of,
     colors_of_sh0,
@@ -31,7 +31,6 @@ _FLOATS = [("mean", "<f4", 3), ("scale", "<f4", 3)]
 _ROW = np.dtype([*_FLOATS, ("rgb", "u1", 3), ("opacity", "u1"), ("quat", "u1", 4)])
 _OTHERS = (b"ply\n", b"ply\r", b"<!do", b"<htm", b"<?xm")  # starts of PLY files and web pages
 _CHUNK_ROWS = 1 << 16
-
 _HEADER_BYTES = 4096
 _HEADER = struct.Struct("<BBxxIIIIHxx3fff")
 _SECTION = struct.Struct("<IIIIfHxxIIIIH982x")
@@ -117,9 +116,7 @@ def read_ksplat(path: Path) -> GaussianScene:
                 f"version {major}.{minor} and compression {level}."
             )
         if _HEADER_BYTES + most * _SECTION.size > size:
-            raise FileFormatError(
-                f"{path}: must hold the headers of {most:,} sections, found {size:,} bytes."
-            )
+            raise FileFormatError(f"{path}: must hold {most:,} sections, found {size:,} bytes.")
         headers = file.read(most * _SECTION.size)
         sections = [_Section(*fields) for fields in _SECTION.iter_unpack(headers)]
         sh_range = (low or _SH_RANGE[0], high or _SH_RANGE[1])
@@ -137,7 +134,7 @@ def read_ksplat(path: Path) -> GaussianScene:
             f"{path}: the sections must hold the {count:,} Gaussians that the header promises, "
             f"and at least one, found {found:,}."
         )
-    names = [field.name for field in dataclasses.fields(Arrays)]
+    names = ARRAY_NAMES
     joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     return scene_of(Arrays(**joined))
 
@@ -145,8 +142,7 @@ def read_ksplat(path: Path) -> GaussianScene:
 def _row_type(level: int, degree: int, path: Path) -> np.dtype[Any]:
     if degree >= len(_COMPONENTS):
         raise FileFormatError(
-            f"{path}: a .ksplat must have an SH degree of at most {len(_COMPONENTS) - 1}, "
-            f"found {degree}."
+            f"{path}: must have an SH degree of at most {len(_COMPONENTS) - 1}, found {degree}."
         )
     mean, half, sh = _NUMBERS[level]
     fields = [("mean", mean, 3), ("scale", half, 3), ("quat", half, 4)]

@@ -46,7 +46,6 @@ _TABLE_ENTRY = struct.Struct("<QQ")  # compressed and uncompressed size of a blo
 _COLOR_SCALE = np.float32(0.15)  # bytes hold ``0.5 + 0.15 sh0``, wider than displayable colours
 _STORED_REST_COUNTS = (*REST_COUNTS, 24)  # a scene leaves out the coefficients of degree 4
 _GZIP_BITS = zlib.MAX_WBITS | 16  # zlib's code for gzip, without name and time
-
 _USUAL_BITS = 12  # as in Niantic's library
 _MOST_BITS, _MOST_READ_BITS = 22, 24
 _OUTLIERS = 0.001  # share of the Gaussians that may be clamped
@@ -170,8 +169,7 @@ def _means_of(stored: UInt8[np.ndarray, "n 3 b"], header: SpzHeader) -> Float[np
         return stored.view("<f2")[..., 0].astype(np.float32)
     low, middle, high = np.moveaxis(stored.astype(np.int32), 2, 0)
     signed = (low << 8 | middle << 16 | high << 24) >> 8
-    means: Float[np.ndarray, "n 3"] = signed.astype(np.float32)
-    return means * np.float32(0.5**header.fractional_bits)
+    return np.asarray(signed.astype(np.float32) * np.float32(0.5**header.fractional_bits))
 
 
 def _quats_of(stored: UInt8[np.ndarray, "n b"]) -> Float[np.ndarray, "n 4"]:
@@ -387,8 +385,7 @@ def _pack_quats(quats: Float[np.ndarray, "n 4"], version: int) -> UInt8[np.ndarr
     sizes = np.minimum((np.abs(others) * (511 / HALF_RANGE) + 0.5).astype(np.uint32), 511)
     fields = sizes | np.where(others < 0, np.uint32(512), np.uint32(0))
     words = largest.astype(np.uint32) << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
-    stored: UInt8[np.ndarray, "n b"] = words.astype("<u4")[:, None].view(np.uint8)
-    return stored
+    return np.asarray(words.astype("<u4")[:, None].view(np.uint8))
 
 
 def _pack_rest(rest: Float[np.ndarray, "n k 3"]) -> UInt8[np.ndarray, "n b"]:
@@ -396,5 +393,4 @@ def _pack_rest(rest: Float[np.ndarray, "n k 3"]) -> UInt8[np.ndarray, "n b"]:
     bands = np.repeat([8, 16], [REST_COUNTS[1], REST_COUNTS[3] - REST_COUNTS[1]])
     steps = bands[: rest.shape[1], None].astype(np.float32)
     stored = np.floor((np.rint(128 * rest) + 128 + steps / 2) / steps) * steps
-    whole: UInt8[np.ndarray, "n b"] = np.clip(stored, 0, 255).astype(np.uint8)
-    return whole
+    return np.asarray(np.clip(stored, 0, 255), np.uint8)

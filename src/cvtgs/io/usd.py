@@ -19,8 +19,7 @@ _SIGMAS = 3.0  # extent of a Gaussian in the bounds, in standard deviations
 
 def write_usda(scene: GaussianScene, file: BinaryIO) -> None:
     """Write a stage with one prim, in the order and axes of the scene, with float32 precision."""
-    for text in _document(scene, arrays_of(scene)):
-        file.write(text.encode())
+    file.writelines(text.encode() for text in _document(scene, arrays_of(scene)))
 
 
 def _document(scene: GaussianScene, arrays: Arrays) -> Iterator[str]:

@@ -33,16 +33,13 @@ QUANTIZATION = "KHR_mesh_quantization"
 KERNEL = "ellipse"
 COLOR_SPACE = "srgb_rec709_display"
 AXES = "luf"  # axes of every glTF: y up, z forward, hence x left (section 3.4 of glTF 2.0)
-
 POSITION, COLOR = "POSITION", "COLOR_0"
 ROTATION, SCALE, OPACITY = f"{SPLATS}:ROTATION", f"{SPLATS}:SCALE", f"{SPLATS}:OPACITY"
-
 MAGIC, VERSION = b"glTF", 2
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
-
 BYTE, UNSIGNED_BYTE, SHORT, UNSIGNED_SHORT, FLOAT = 5120, 5121, 5122, 5123, 5126
-_COMPONENTS: dict[int, np.dtype[Any]] = {
+COMPONENTS: dict[int, np.dtype[Any]] = {
     BYTE: np.dtype("i1"),
     UNSIGNED_BYTE: np.dtype("u1"),
     SHORT: np.dtype("<i2"),
@@ -162,7 +159,7 @@ class GltfFile:
         integers, encodings = _ENCODINGS.get(name, (frozenset(), "floats"))
         if name == POSITION and QUANTIZATION not in self.root.extensionsUsed:
             integers = frozenset()
-        dtype = _COMPONENTS.get(component)
+        dtype = COMPONENTS.get(component)
         fits = component == FLOAT or (component, accessor.normalized) in integers
         if accessor.type != kind or dtype is None or not fits:
             scaled = ", normalized" if accessor.normalized else ", not normalized"
@@ -184,9 +181,8 @@ class GltfFile:
         end = accessor.byteOffset + stride * (accessor.count - 1) + width
         if accessor.count == 0 or end > len(content):
             raise self.error(
-                f"{where} must have at least one element and end within its buffer view of "
-                f"{len(content):,} bytes, found {accessor.count:,} elements that end at "
-                f"byte {end:,}"
+                f"{where} must have at least one element and end within {len(content):,} bytes, "
+                f"found {accessor.count:,} elements that end at byte {end:,}"
             )
         shape, strides = (accessor.count, WIDTHS[kind]), (stride, dtype.itemsize)
         rows: NDArray[Any] = np.ndarray(shape, dtype, content, accessor.byteOffset, strides)
@@ -226,9 +222,7 @@ class GltfFile:
         """Read a file once, however many buffers it is."""
         name = unquote(uri)
         if not is_within(name) or len(name) > LONGEST_NAME:  # such as a damaged data URI
-            raise self.error(
-                f"buffers[{index}] must be in the folder of the file, found {shown(uri)}"
-            )
+            raise self.error(f"buffers[{index}] must be in the file's folder, found {shown(uri)}")
         path = self.path.parent / PurePosixPath(name)
         with open_input(path) as file:
             place = path.resolve()

@@ -112,9 +112,7 @@ def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False)
     file = open_gltf(path)
     strange = [name for name in file.root.extensionsRequired if name not in _KNOWN]
     if strange:
-        raise file.error(
-            f"must require no extensions other than {', '.join(_KNOWN)}, found {shown(strange[0])}"
-        )
+        raise file.error(f"must require only {', '.join(_KNOWN)}, found {shown(strange[0])}")
     placed = _splats(file, math.inf if trust_sizes else file.stored // _NODE_BYTES + _MOST_PLACED)
     if not placed:
         raise file.error(f"must have a mesh primitive with {SPLATS}, found none")
@@ -253,8 +251,7 @@ def _read_attributes(file: GltfFile, one: _Splats) -> GaussianScene:
         values = file.values(_index(file, one, name), kind, name)
         if len(values) != len(means):
             raise file.error(
-                f"all attributes must have {len(means):,} elements like {POSITION}, found "
-                f"{len(values):,} in {name}"
+                f"{name} must have {len(means):,} elements like {POSITION}, found {len(values):,}"
             )
         return values
 
@@ -300,9 +297,7 @@ def _degree(file: GltfFile, one: _Splats) -> int:
             continue
         if missing or degree != band - 1:
             lacking = missing[0] if missing else coefficients(band - 1)[0]
-            raise file.error(
-                f"Gaussians must have all SH coefficients up to degree {band}, found no {lacking}"
-            )
+            raise file.error(f"Gaussians must have all SH up to degree {band}, found no {lacking}")
         degree = band
     return degree
 
@@ -316,10 +311,7 @@ def _moved(file: GltfFile, scene: GaussianScene, matrix: Matrix) -> GaussianScen
         even = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_EVENNESS)
     affine = np.array_equal(matrix[3], [0, 0, 0, 1]) and bool(np.isfinite(matrix).all())
     if not even or not affine:
-        raise file.error(
-            "nodes must only rotate, translate and uniformly scale Gaussians, found one that "
-            "stretches, skews or mirrors them"
-        )
+        raise file.error("nodes must only rotate, move and scale uniformly, found a skew or mirror")
     w, a, b, c = matrices_to_quats(torch.from_numpy(rotation)[None])[0].tolist()
     x, y, z = matrix[:3, 3].tolist()
     motion = Motion(quat=(w, a, b, c), scale=scale, shift=(x, y, z))

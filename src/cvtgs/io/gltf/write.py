@@ -4,8 +4,7 @@ import base64
 import io
 import json
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
-from typing import Any, BinaryIO, Final
+from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -26,6 +25,7 @@ from cvtgs.io.gltf.document import (
     CHUNK,
     COLOR,
     COLOR_SPACE,
+    COMPONENTS,
     FLOAT,
     HEADER,
     JSON_CHUNK,
@@ -53,23 +53,25 @@ _DATA = "data:application/octet-stream;base64,"
 _SPZ_VERSION: Final = 3  # the newest version that readers of the draft of the extension accept
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Attribute:
+class _Attribute(NamedTuple):
     """An attribute of all Gaussians; its values are computed in chunks."""
 
     name: str
     kind: str
-    component: int = FLOAT
     values: Callable[[slice], Shaped[np.ndarray, "n k"]]
 
     @property
+    def component(self) -> int:
+        return UNSIGNED_BYTE if self.name == COLOR else FLOAT
+
+    @property
     def row_bytes(self) -> int:
-        return WIDTHS[self.kind] * (4 if self.component == FLOAT else 1)
+        return WIDTHS[self.kind] * COMPONENTS[self.component].itemsize
 
     def parts(self, count: int) -> Iterator[bytes]:
         for start in range(0, count, _CHUNK_ROWS):
             values = self.values(slice(start, min(start + _CHUNK_ROWS, count)))
-            yield np.ascontiguousarray(values).tobytes()
+            yield np.ascontiguousarray(values, COMPONENTS[self.component]).tobytes()
 
 
 def write_glb(scene: GaussianScene, file: BinaryIO) -> None:
@@ -117,11 +119,6 @@ def write_spz_glb(scene: GaussianScene, file: BinaryIO) -> None:
 
 
 def _attributes(arrays: Arrays) -> list[_Attribute]:
-    def floats(name: str, kind: str, values: Callable[[slice], Any]) -> _Attribute:
-        return _Attribute(
-            name=name, kind=kind, values=lambda part: values(part).astype("<f4", copy=False)
-        )
-
     def colors(part: slice) -> Bytes:
         rgb = to_bytes(255 * colors_of_sh0(arrays.sh0[part]))
         return np.column_stack([rgb, opacity_bytes(arrays.logit_opacities[part])])
@@ -132,13 +129,13 @@ def _attributes(arrays: Arrays) -> list[_Attribute]:
     bands = range(1, 1 + degree_of(arrays.shN.shape[1]))
     names = [name for band in bands for name in coefficients(band)]
     return [
-        floats(POSITION, "VEC3", lambda part: arrays.means[part]),
-        _Attribute(name=COLOR, kind="VEC4", component=UNSIGNED_BYTE, values=colors),
-        floats(ROTATION, "VEC4", lambda part: np.roll(arrays.quats[part], -1, axis=1)),
-        floats(SCALE, "VEC3", lambda part: scales_of(arrays.log_scales[part])),
-        floats(OPACITY, "SCALAR", lambda part: opacities_of(arrays.logit_opacities[part])),
-        floats(coefficients(0)[0], "VEC3", lambda part: arrays.sh0[part]),
-        *(floats(name, "VEC3", rest(number)) for number, name in enumerate(names)),
+        _Attribute(POSITION, "VEC3", lambda part: arrays.means[part]),
+        _Attribute(COLOR, "VEC4", colors),
+        _Attribute(ROTATION, "VEC4", lambda part: np.roll(arrays.quats[part], -1, axis=1)),
+        _Attribute(SCALE, "VEC3", lambda part: scales_of(arrays.log_scales[part])),
+        _Attribute(OPACITY, "SCALAR", lambda part: opacities_of(arrays.logit_opacities[part])),
+        _Attribute(coefficients(0)[0], "VEC3", lambda part: arrays.sh0[part]),
+        *(_Attribute(name, "VEC3", rest(number)) for number, name in enumerate(names)),
     ]
 
 
@@ -209,8 +206,7 @@ def write_chunks(
     length = HEADER.size + 2 * CHUNK.size + len(text) + padded
     if length >= _MOST_BYTES:
         raise InvalidSceneError(
-            f"a .glb must be smaller than 4 GiB, found a scene that takes {length:,} bytes; write "
-            f".spz.glb, or simplify it."
+            f"a .glb must be below 4 GiB, found {length:,} bytes; write .spz.glb, or simplify."
         )
     file.write(HEADER.pack(MAGIC, VERSION, length))
     file.write(CHUNK.pack(len(text), JSON_CHUNK) + text)

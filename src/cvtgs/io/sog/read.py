@@ -39,7 +39,6 @@ from cvtgs.text import shown
 META = "meta.json"
 QUAT_TAG = 252  # the last byte of a rotation is this plus the number of its omitted component
 PALETTE_COLUMNS = 64  # entries of the SH palette per row of its image
-
 _MOST_META_BYTES = 1 << 20  # real ones have about ten thousand bytes
 _PNG = b"\x89PNG\r\n\x1a\n"
 _MOST_COUNT = 16383**2  # pixels of the largest WebP image
@@ -212,8 +211,7 @@ def _meta_of_version_1(content: Any, where: str) -> _Meta:
 
     def tables(mins: Sequence[float], maxs: Sequence[float]) -> Float[np.ndarray, "k 256"]:
         low, high = np.array(mins)[:, None], np.array(maxs)[:, None]
-        values: Float[np.ndarray, "k 256"] = low + (high - low) * (np.arange(256) / 255)
-        return values
+        return np.asarray(low + (high - low) * (np.arange(256) / 255))
 
     sh0, rest = tables(document.sh0.mins, document.sh0.maxs), document.shN
     return _Meta(
@@ -292,8 +290,7 @@ def _quats(stored: UInt8[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
 def _decoded(
     table: Float[np.ndarray, "3 256"], stored: UInt8[np.ndarray, "n 4"]
 ) -> Float[np.ndarray, "n 3"]:
-    values: Float[np.ndarray, "n 3"] = table.astype(np.float32)[np.arange(3), stored[:, :3]]
-    return values
+    return np.asarray(table.astype(np.float32)[np.arange(3), stored[:, :3]])
 
 
 def _rest(images: _Images, meta: _Meta) -> Float[np.ndarray, "n k 3"]:

@@ -115,8 +115,7 @@ def _places(meta: _LodMeta, lod: int, path: Path) -> Iterator[tuple[int, _Rows]]
         rows = validated(_Rows, levels[str(level)], f"{path}: chunk {chunk}, level {level}")
         if rows.file >= len(meta.filenames):
             raise FileFormatError(
-                f"{path}: filenames has {len(meta.filenames):,} entries, found a reference to "
-                f"{rows.file}."
+                f"{path}: filenames has {len(meta.filenames):,} entries, found number {rows.file}."
             )
         yield level, rows
 
@@ -171,8 +170,7 @@ def _read_rows(source: Path, parts: Sequence[range], *, trust_sizes: bool) -> Ga
     scene = read_sog(source, trust_sizes=trust_sizes)
     if parts and parts[-1].stop > len(scene):
         raise FileFormatError(
-            f"{source}: must have the {parts[-1].stop:,} Gaussians that the stream reads from it, "
-            f"found {len(scene):,}."
+            f"{source}: the stream needs {parts[-1].stop:,} Gaussians, found {len(scene):,}."
         )
     if not parts or sum(map(len, parts)) == len(scene):
         return scene

@@ -72,9 +72,6 @@ def encode_sog(scene: GaussianScene) -> EncodedSog:
     Args:
         scene: The scene, on any device; a SOG must be able to hold all its rows.
 
-    Returns:
-        The encoded files.
-
     Raises:
         InvalidSceneError: A Gaussian of the scene is not finite.
     """
@@ -214,8 +211,7 @@ def _first_codes(ordered: Float[np.ndarray, "n"]) -> Float[np.ndarray, "256"]:
     if usual > 0:
         steps = np.minimum(steps, _WIDEST_GAP * usual)
     passed = np.concatenate([[0.0], np.cumsum(steps)])
-    codes: Float[np.ndarray, 256] = np.interp(np.linspace(0, passed[-1], _CODES), passed, knots)
-    return codes
+    return np.asarray(np.interp(np.linspace(0, passed[-1], _CODES), passed, knots))
 
 
 class Palette(NamedTuple):
