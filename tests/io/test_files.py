@@ -51,8 +51,7 @@ def test_a_git_lfs_pointer_is_refused(tmp_path: Path, end: str) -> None:
     with pytest.raises(FileFormatError) as caught:
         load(path)
     assert str(caught.value) == (
-        f"{path}: must be the file itself, found a Git LFS pointer to it; fetch the file with: "
-        f"git lfs pull."
+        f"{path}: must be the file itself, found a Git LFS pointer; run: git lfs pull."
     )
 
 
@@ -99,7 +98,7 @@ def test_an_unknown_suffix_is_refused(tmp_path: Path, name: str, found: str) -> 
     with pytest.raises(FileFormatError) as caught:
         load(path)
     assert str(caught.value) == (
-        f"{path}: the file name must end in .compressed.ply, .ply, .spz, .ksplat, .splat, .sog, "
+        f"{path}: must end in .compressed.ply, .ply, .spz, .ksplat, .splat, .sog, "
         f"lod-meta.json, meta.json, .glb, .gltf, .ckpt or .pt, found {found}."
     )
 

@@ -88,12 +88,11 @@ HEADER_CASES: Mapping[str, tuple[bytes, str]] = {
     "plywood": (b"plywood", "a PLY file must start with the line 'ply', found b'plywood'."),
     "no end": (
         GOOD[:200],
-        "the PLY header must end with a line 'end_header', found none in the first 200 bytes.",
+        "the header must end with 'end_header', found none in 200 bytes.",
     ),
     "endless": (
         b"ply\n" + b"comment no end_header here\n" * (MAX_HEADER_BYTES // 20),
-        "the PLY header must end with a line 'end_header', found none in the first "
-        "1,048,576 bytes.",
+        "the header must end with 'end_header', found none in 1,048,576 bytes.",
     ),
     "nothing": (
         b"ply\nend_header\n",
@@ -163,7 +162,7 @@ VERTEX_CASES: Mapping[str, tuple[bytes, str]] = {
     ),
     "list": (
         with_list("scale_1"),
-        "property 'scale_1' of 'vertex' must be a number, found a list.",
+        "property 'scale_1' must be a number, found a list.",
     ),
     "odd f_rest": (
         with_rest(*range(10)),
@@ -237,7 +236,7 @@ DATA_CASES: Mapping[str, tuple[bytes, str]] = {
     ),
     "number too few": (
         ascii_row(0, lambda words: words.pop(-1) and None),
-        "row 0 of 'vertex' must have a value for property 'rot_3', found the end of the line.",
+        "row 0 of 'vertex' must have a value for 'rot_3', found the end of the line.",
     ),
     "number too many": (
         ascii_row(2, lambda words: words.append("1")),
@@ -269,8 +268,7 @@ def test_integers_out_of_range_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError) as caught:
         load(tmp_path / "s.ply")
     assert str(caught.value).startswith(
-        f"{tmp_path}/s.ply: every value must be a number of the type of its property, found "
-        f"one that is not: "
+        f"{tmp_path}/s.ply: every value must be of the type of its property, found one not: "
     )
 
 
@@ -337,6 +335,6 @@ def test_without_plyfile_unusual_files_say_what_to_install(
     with pytest.raises(MissingDependencyError) as caught:
         load(unusual)
     assert str(caught.value) == (
-        f"{unusual}: a PLY that is not plain binary needs the package plyfile; "
+        f"{unusual}: a PLY not in plain binary needs plyfile; "
         "install it with python -m pip install plyfile."
     )

@@ -253,12 +253,11 @@ def test_parameters_with_gradients_can_be_saved(tmp_path: Path) -> None:
         ),
         (
             {"extras": {"q": torch.ones(2, dtype=torch.complex64)}},
-            "extra column 'q' must hold real numbers to be written to a PLY, found "
-            "torch.complex64.",
+            "extra column 'q' must be real for a PLY, found torch.complex64.",
         ),
         (
             {"comments": ("fine", "end\nend_header")},
-            "a comment must be one line to be written to a PLY, found 'end\\nend_header'.",
+            "a PLY comment must be one line, found 'end\\nend_header'.",
         ),
         (
             {"comments": ("\ud800",)},
@@ -272,8 +271,8 @@ def test_parameters_with_gradients_can_be_saved(tmp_path: Path) -> None:
         ),
         (
             {"layout": (("x", "half"), ("scale_2", "float"))},
-            "the layout must give property 'x' one of the types char, uchar, short, ushort, int, "
-            "uint, float, double, found 'half'.",
+            "the layout must give 'x' a type of char, uchar, short, ushort, int, uint, float, "
+            "double, found 'half'.",
         ),
     ],
 )
@@ -294,6 +293,6 @@ def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError) as caught:
         save(make_scene(), tmp_path / "s.ckpt")
     assert str(caught.value) == (
-        f"{tmp_path}/s.ckpt: the file name must end in .compressed.ply, .ply, .spz, .splat, .sog, "
+        f"{tmp_path}/s.ckpt: must end in .compressed.ply, .ply, .spz, .splat, .sog, "
         f".spz.glb, .glb, .gltf or .usda, found the suffix '.ckpt'."
     )

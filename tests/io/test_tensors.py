@@ -97,14 +97,14 @@ DAMAGE = {
 def test_damaged_bytes_are_refused(tmp_path, damage):
     content = damage(pack_tensors(TENSORS, METADATA))
     with pytest.raises(
-        FileFormatError, match=r"^these bytes are not a safetensors file, or they are damaged\.$"
+        FileFormatError, match=r"^must be the bytes of a safetensors file, found others\.$"
     ):
         unpack_tensors(content)
     path = tmp_path / "some.safetensors"
     path.write_bytes(content)
     with pytest.raises(FileFormatError) as caught:
         map_tensors(path)
-    assert str(caught.value) == f"{path}: the file is not a safetensors file, or it is damaged."
+    assert str(caught.value) == f"{path}: must be an intact safetensors file, found none."
 
 
 def test_a_missing_file_is_refused(tmp_path):

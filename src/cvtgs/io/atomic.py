@@ -102,9 +102,6 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
         overwrite: Whether an existing file may be replaced. If not, a file that appears under
             this name during the write is not replaced either.
 
-    Yields:
-        The open binary file.
-
     Raises:
         OutputExistsError: The file exists and may not be replaced.
         OutputError: The file cannot be written (directory missing, no permission, disk full).

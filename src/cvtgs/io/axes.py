@@ -19,7 +19,6 @@ AXES = (  # where x, y and z point (left, right, up, down, back, forward); SPZ c
 )
 
 SCENE_AXES = "rdf"  # the axes of scenes in memory: right, down, forward, as in PLY files of 3DGS
-
 _DIRECTIONS = {"r": (1, 0, 0), "u": (0, 1, 0), "b": (0, 0, 1)}
 _DIRECTIONS |= {"l": (-1, 0, 0), "d": (0, -1, 0), "f": (0, 0, -1)}
 

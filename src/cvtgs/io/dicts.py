@@ -60,7 +60,6 @@ _NUMPY_NAMES = {
     "_codecs.encode",
 }
 _STAND_INS = threading.Lock()  # held while stand-ins for these are among torch's safe names
-
 _BYTE_CODECS = re.compile(r"(?i)(hex|base.?64|quopri|quoted.?printable|uu|bz2|zlib|zip)(.?codec)?")
 _PREFIXES = ("", "_model.gauss_params.", "_model.", "module._model.gauss_params.")
 
@@ -165,23 +164,14 @@ def to_dict(scene: GaussianScene) -> dict[str, Tensor]:
         ['means', 'quats', 'scales', 'opacities', 'sh0', 'shN']
     """
     check_scene(scene)
-    return {
-        "means": scene.means,
-        "quats": scene.quats,
-        "scales": scene.log_scales,
-        "opacities": scene.logit_opacities,
-        "sh0": scene.sh0,
-        "shN": scene.shN,
-    }
+    return {name: getattr(scene, _TENSORS[name]) for name in (*_NEEDED, "shN")}
 
 
 def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
     """Return the key of each tensor; their common prefix is the text before ``means``."""
     ends = [key for key in mapping if str(key) == "means" or str(key).endswith(".means")]
     if len(ends) > 1:
-        raise InvalidSceneError(
-            f"a dictionary must hold means only once, found {' and '.join(map(repr, ends))}."
-        )
+        raise InvalidSceneError(f"means must occur once, found {' and '.join(map(repr, ends))}.")
     prefix = ends[0].removesuffix("means") if ends else ""
     keys: dict[str, str] = {}
     for key in mapping:
@@ -195,15 +185,12 @@ def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
             raise InvalidSceneError(f"the names must be {_KNOWN}, found {shown(key)}{hint}.")
         if name in keys:
             raise InvalidSceneError(
-                f"a dictionary must hold {name} only once, found {shown(keys[name])} "
-                f"and {shown(key)}."
+                f"a dictionary must hold {name} once, found {shown(keys[name])} and {shown(key)}."
             )
         keys[name] = key
     missing = [name for name in _NEEDED if _TENSORS[name] not in keys]
     if missing:
-        raise InvalidSceneError(
-            f"a dictionary must hold {_KNOWN}, found none named {', '.join(missing)}."
-        )
+        raise InvalidSceneError(f"a dictionary must hold {_KNOWN}, found no {', '.join(missing)}.")
     return keys
 
 
@@ -273,10 +260,8 @@ def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
     except Exception as error:  # torch's messages may advise letting the file execute any code
         if is_out_of_memory(error):
             raise
-        raise FileFormatError(
-            f"{path}: must be an intact checkpoint of tensors and plain numbers, found damage "
-            f"({type(error).__name__})."
-        ) from error
+        kind = type(error).__name__
+        raise FileFormatError(f"{path}: must be an intact checkpoint, found a {kind}.") from error
     if splatfacto and scene.sh_degree == 0:
         colors = torch.sigmoid(scene.sh0)  # through which it trains them at this degree
         return scene.with_tensors({"sh0": (colors - 0.5) / SH_C0}, {})
@@ -318,8 +303,7 @@ def _unpickled(path: Path) -> Any:
     with open_input(path) as file:
         if not zipfile.is_zipfile(file):
             raise FileFormatError(
-                f"{path}: must be a checkpoint in the zip format of torch.save, "
-                f"found another format."
+                f"{path}: must be a checkpoint in the zip format of torch.save, found another."
             )
     names = set[str]()
     for name in _names_in(path):

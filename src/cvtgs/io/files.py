@@ -29,7 +29,6 @@ _POINTER = b"version https://git-lfs."  # replaces a large file in a clone witho
 _ITERATION = re.compile(r"iteration_(\d{1,18})")
 _STEP = re.compile(r"step-(\d{1,18})\.ckpt")
 _GSPLAT_STEP = re.compile(r"ckpt_(\d+)_rank0\.pt")
-
 FREE_BYTES = 1 << 26  # a scene of at most this many bytes in memory may come from any file
 MOST_EXPANSION = 64  # else, it may take this many times the bytes of its file; real ones take 4-13
 MOST_JSON_BYTES = 1 << 26  # a larger .gltf has its buffers inside
@@ -52,8 +51,7 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
         with path.open("rb") as file:
             if file.peek(len(_POINTER)).startswith(_POINTER):
                 raise FileFormatError(
-                    f"{path}: must be the file itself, found a Git LFS pointer to it; fetch the "
-                    "file with: git lfs pull."
+                    f"{path}: must be the file itself, found a Git LFS pointer; run: git lfs pull."
                 )
             yield file
 
@@ -87,9 +85,6 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
 
     Args:
         path: A folder, or a file, which is returned as it is.
-
-    Returns:
-        The file.
 
     Raises:
         InputError: The folder has none of these, or cannot be read.

@@ -48,7 +48,6 @@ class FormatLimits:
 
 LOST_DIGITS = "digits of positions"
 _USUAL_SPZ_STEP = 1 / 4096
-
 _SPZ = FormatLimits(  # of versions 3 and 4
     ranges={
         "log_scales": (-10 - 1 / 32, 255 / 16 - 10 + 1 / 32),

@@ -17,7 +17,6 @@ from cvtgs.io.atomic import replace_file
 
 MEMORY_BYTES = 1 << 26  # a file is built in memory up to this size, and on disk beyond it
 CHUNK_BYTES = 1 << 16  # bytes of a stream that are read at once
-
 _FIRST_BYTES = {b"ply": ".ply", b"\x1f\x8b": ".spz", b"NGSP": ".spz", b"glTF": ".glb"}
 _MOST_FIRST_BYTES = max(map(len, _FIRST_BYTES))
 _TORCH_MEMBER = re.compile(r"[^/]+/data\.pkl")

@@ -39,9 +39,7 @@ def unpack_tensors(content: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
         length = int.from_bytes(content[:8], "little")
         metadata = json.loads(content[8 : 8 + length]).get("__metadata__") or {}
     except (SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise FileFormatError(
-            "these bytes are not a safetensors file, or they are damaged."
-        ) from error
+        raise FileFormatError("must be the bytes of a safetensors file, found others.") from error
     return tensors, metadata
 
 
@@ -64,9 +62,7 @@ def map_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[s
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             return tensors, dict(file.metadata() or {})
     except (SafetensorError, OSError) as error:
-        raise FileFormatError(
-            f"{path}: the file is not a safetensors file, or it is damaged."
-        ) from error
+        raise FileFormatError(f"{path}: must be an intact safetensors file, found none.") from error
 
 
 def tensors_digest(tensors: Mapping[str, Tensor], text: str) -> str:

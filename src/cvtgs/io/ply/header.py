@@ -19,7 +19,6 @@ Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
 
 Layout = tuple[tuple[str, str], ...]  # property names and PLY types of an element, in order
 MAX_HEADER_BYTES = 1 << 20  # longer headers are refused; a 3DGS header has about two thousand bytes
-
 _OTHER_FILES = {
     b"\x1f\x8b": "a gzip file; unpack it first, or rename it if it is an .spz",
     b"PK\x03\x04": "a zip archive; unpack it first, or rename it if it is a .sog",
@@ -27,7 +26,6 @@ _OTHER_FILES = {
 }
 _COUNT = re.compile("[0-9]{1,18}")
 MAX_NAME_LETTERS = 200
-
 _REST_NAME = re.compile(r"f_rest_(0|[1-9][0-9]*)")
 
 
@@ -159,8 +157,7 @@ def _header_lines(block: bytes, path: str) -> tuple[list[str], int]:
     )
     if not end:
         raise FileFormatError(
-            f"{path}: the PLY header must end with a line 'end_header', found none in the first "
-            f"{len(block):,} bytes."
+            f"{path}: the header must end with 'end_header', found none in {len(block):,} bytes."
         )
     lines = block[first.end() : max(first.end(), end.start())].split(newline)
     return [_decode(line).replace("\n", " ") for line in lines], end.end()
@@ -200,9 +197,7 @@ def header_bytes(comments: Iterable[str], elements: Iterable[tuple[str, int, Lay
     lines = ["ply", "format binary_little_endian 1.0"]
     for comment in comments:
         if "\n" in comment:
-            raise InvalidSceneError(
-                f"a comment must be one line to be written to a PLY, found {comment[:80]!r}."
-            )
+            raise InvalidSceneError(f"a PLY comment must be one line, found {comment[:80]!r}.")
         lines.append(f"comment {comment}".rstrip())
     for name, count, columns in elements:
         lines.append(f"element {name} {count}")
@@ -280,7 +275,27 @@ def find_vertices(header: Header, path: str) -> Element:
         found = ", ".join(shown(element.name) for element in header.elements[:5]) or "no element"
         found += ", ..." if len(header.elements) > 5 else ""
         raise FileFormatError(f"{path}: must have an element 'vertex', found {found}.")
-    _check_properties(vertex, path)
+    scalars = {prop.name: prop.count_type is None for prop in vertex.properties}
+    lists = [name for name, scalar in scalars.items() if is_standard(name) and not scalar]
+    if lists:
+        raise FileFormatError(f"{path}: property {shown(lists[0])} must be a number, found a list.")
+    needed = standard_slots(0).keys() - {"scale_2"}  # 2DGS has two scales
+    missing = [name for name in standard_slots(0) if name in needed and name not in scalars]
+    if missing:
+        names = ", ".join(missing)
+        is_cloud = set(missing) == needed - set("xyz")
+        hint = "; train a scene from a point cloud or mesh first" if is_cloud else ""
+        raise FileFormatError(
+            f"{path}: a 3DGS scene must have the 'vertex' properties x, y, z, f_dc_0..2, opacity, "
+            f"scale_0..1 and rot_0..3, found none named {names}{hint}."
+        )
+    numbers = sorted(number for name in scalars if (number := rest_index(name)) is not None)
+    gap = next((i for i, number in enumerate(numbers) if i != number), None)
+    if gap is not None or len(numbers) not in [3 * count for count in REST_COUNTS]:
+        raise FileFormatError(
+            f"{path}: 'vertex' must have 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3) "
+            f"numbered from 0, found {len(numbers)}{'' if gap is None else f', no f_rest_{gap}'}."
+        )
     if vertex.count == 0:
         raise FileFormatError(f"{path}: must hold at least one Gaussian, found 'element vertex 0'.")
     return vertex
@@ -310,29 +325,3 @@ def layout_of(vertex: Element) -> Layout:
         (name, float_type if is_standard(name) and kind not in FLOAT_TYPES else kind)
         for name, kind in vertex.columns
     )
-
-
-def _check_properties(vertex: Element, path: str) -> None:
-    scalars = {prop.name: prop.count_type is None for prop in vertex.properties}
-    lists = [name for name, scalar in scalars.items() if is_standard(name) and not scalar]
-    if lists:
-        raise FileFormatError(
-            f"{path}: property {shown(lists[0])} of 'vertex' must be a number, found a list."
-        )
-    needed = standard_slots(0).keys() - {"scale_2"}  # 2DGS has two scales
-    missing = [name for name in standard_slots(0) if name in needed and name not in scalars]
-    if missing:
-        names = ", ".join(missing)
-        is_cloud = set(missing) == needed - set("xyz")
-        hint = "; train a scene from a point cloud or mesh first" if is_cloud else ""
-        raise FileFormatError(
-            f"{path}: a 3DGS scene must have the 'vertex' properties x, y, z, f_dc_0..2, opacity, "
-            f"scale_0..1 and rot_0..3, found none named {names}{hint}."
-        )
-    numbers = sorted(number for name in scalars if (number := rest_index(name)) is not None)
-    gap = next((i for i, number in enumerate(numbers) if i != number), None)
-    if gap is not None or len(numbers) not in [3 * count for count in REST_COUNTS]:
-        raise FileFormatError(
-            f"{path}: 'vertex' must have 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3) "
-            f"numbered from 0, found {len(numbers)}{'' if gap is None else f', no f_rest_{gap}'}."
-        )

@@ -47,7 +47,6 @@ from cvtgs.text import first_of, shown
 
 CHUNK_BYTES = 1 << 20  # mapped at a time; a chunk and its copy fit into the L2 cache
 _CHUNK_ROWS = 1 << 12  # rows of plyfile that are copied at a time; they fit into a cache
-
 _NOT_ASCII = bytes.maketrans(bytes(range(128, 256)), b"?" * 128)
 
 
@@ -75,11 +74,6 @@ def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -
             sh_degree=sh_degree,
             with_extras=extras,
         )
-    _warn_of_dropped(header, vertex, where)
-    return scene
-
-
-def _warn_of_dropped(header: Header, vertex: Element, path: str) -> None:
     dropped = [
         f"element {shown(element.name)} ({element.count:,} rows)"
         for element in header.elements
@@ -91,11 +85,8 @@ def _warn_of_dropped(header: Header, vertex: Element, path: str) -> None:
         if prop.count_type
     ]
     if dropped:
-        warn(
-            f"{path}: left out {first_of(dropped, length=120)}, since a scene holds one number "
-            f"per Gaussian and property.",
-            DroppedDataWarning,
-        )
+        warn(f"{where}: left out {first_of(dropped, length=120)}.", DroppedDataWarning)
+    return scene
 
 
 def assemble(
@@ -203,8 +194,7 @@ def _parsed_rows(file: BinaryIO, header: Header, vertex: Element, path: str) -> 
         from plyfile import PlyData, PlyElementParseError, PlyParseError  # noqa: PLC0415
     except ImportError as error:
         raise MissingDependencyError(
-            f"{path}: a PLY that is not plain binary needs the package plyfile; "
-            f"{how_to_install('plyfile')}."
+            f"{path}: a PLY not in plain binary needs plyfile; {how_to_install('plyfile')}."
         ) from error
     needed = header.elements[: header.elements.index(vertex) + 1]
     # Numpy warns of empty lists in text; elsewhere the filters of the process stay as they are.
@@ -221,8 +211,7 @@ def _parsed_rows(file: BinaryIO, header: Header, vertex: Element, path: str) -> 
         raise FileFormatError(_explain(error, needed, path)) from error
     except (PlyParseError, ValueError, OverflowError) as error:
         raise FileFormatError(
-            f"{path}: every value must be a number of the type of its property, "
-            f"found one that is not: {error}."
+            f"{path}: every value must be of the type of its property, found one not: {error}."
         ) from error
     rows: NDArray[Any] = data.view(np.ndarray)
     rows.dtype.names = tuple(prop.name for prop in vertex.properties)
@@ -278,9 +267,7 @@ def _explain(error: Any, elements: tuple[Element, ...], path: str) -> str:
         return f"{place} must hold {len(element.properties)} values, found more."
     prop = element.properties[int(error.prop.name[1:])]
     if error.message == "early end-of-line":
-        return (
-            f"{place} must have a value for property {shown(prop.name)}, found the end of the line."
-        )
+        return f"{place} must have a value for {shown(prop.name)}, found the end of the line."
     kind = f"list of {prop.type}" if prop.count_type else prop.type
     return f"{place}: property {shown(prop.name)} must be a {kind}, found an unreadable value."
 

@@ -29,18 +29,8 @@ from cvtgs.scene import FLAT_LOG_SCALE, NORMALS, GaussianScene
 from cvtgs.text import counted, shown
 
 CHUNK_BYTES = 1 << 20  # bytes that are gathered before they are written
-
-_NATURAL_TYPES = {
-    torch.bool: "uchar",
-    torch.int8: "char",
-    torch.uint8: "uchar",
-    torch.int16: "short",
-    torch.int32: "int",
-    torch.float16: "float",
-    torch.bfloat16: "float",
-    torch.float32: "float",
-    torch.float64: "double",
-}
+_NATURAL_TYPES = {kind.dtype: name for name, kind in SCALARS.items()}
+_NATURAL_TYPES |= {torch.bool: "uchar", torch.float16: "float", torch.bfloat16: "float"}
 
 
 def write_ply(scene: GaussianScene, file: BinaryIO) -> None:
@@ -81,8 +71,7 @@ def join_plys(paths: Sequence[str | os.PathLike[str]], file: BinaryIO) -> None:
 
 def _rows(tensor: Tensor, start: int, stop: int) -> NDArray[Any]:
     part = tensor[start:stop].detach().cpu()
-    array: NDArray[Any] = (part.float() if part.dtype == torch.bfloat16 else part).numpy()
-    return array
+    return (part.float() if part.dtype == torch.bfloat16 else part).numpy()
 
 
 def lost_scales(scene: GaussianScene) -> str:
@@ -144,8 +133,7 @@ def _check_names(scene: GaussianScene) -> None:
     for name, kind in scene.layout:
         if kind not in SCALARS:
             raise InvalidSceneError(
-                f"the layout must give property {name!r} one of the types {', '.join(SCALARS)}, "
-                f"found {kind!r}."
+                f"the layout must give {name!r} a type of {', '.join(SCALARS)}, found {kind!r}."
             )
 
 
@@ -163,8 +151,7 @@ def _extra_type(name: str, column: Tensor, kind: str | None) -> str:
         )
     if column.dtype not in _NATURAL_TYPES:
         raise InvalidSceneError(
-            f"extra column {name!r} must hold real numbers to be written to a PLY, "
-            f"found {column.dtype}."
+            f"extra column {name!r} must be real for a PLY, found {column.dtype}."
         )
     return _NATURAL_TYPES[column.dtype]
 
