@@ -217,8 +217,8 @@ def test_missing_files_are_one_sentence(tmp_path) -> None:
     )
     (tmp_path / "points.ply").write_bytes(b"ply\n")
     assert camera_refusal(tmp_path / "points.ply") == (
-        f"{tmp_path / 'points.ply'}: a camera file must be JSON (.json) or part of a COLMAP model "
-        f"(cameras.bin, images.bin, cameras.txt, images.txt), found neither."
+        f"{tmp_path / 'points.ply'}: must be a .json or one of COLMAP's cameras.bin, images.bin, "
+        f"cameras.txt, images.txt, found neither."
     )
 
 

@@ -223,13 +223,11 @@ JSON: Mapping[str, tuple[bytes, str]] = {
     ),
     "other object": (
         b'{"w": 3}',
-        "must be a list of cameras (INRIA's cameras.json) or an object with 'frames' "
-        "(transforms.json), found neither.",
+        "must be a list of cameras (INRIA's) or an object with 'frames', found neither.",
     ),
     "a number": (
         b"3",
-        "must be a list of cameras (INRIA's cameras.json) or an object with 'frames' "
-        "(transforms.json), found neither.",
+        "must be a list of cameras (INRIA's) or an object with 'frames', found neither.",
     ),
     "no camera": (b"[]", "must hold at least one camera, found none."),
 }

@@ -196,9 +196,7 @@ def test_a_checkpoint_that_is_cut_short_is_refused(tmp_path: Path, share: float)
     path.write_bytes(content[: int(share * len(content))])
     with pytest.raises(FileFormatError) as caught:
         load(path)
-    assert str(caught.value) == (
-        f"{path}: must be a checkpoint in the zip format of torch.save, found another."
-    )
+    assert str(caught.value) == (f"{path}: must be a zip as torch.save writes, found another.")
 
 
 def test_a_plain_pickle_is_refused(tmp_path: Path) -> None:

@@ -212,8 +212,7 @@ def _file_views(path: Path, split: Split | None) -> list[View]:
         return hold_out(colmap_views(path.parent, as_text=path.suffix == ".txt"), split)
     if path.suffix.lower() != ".json" and is_file(path):
         raise FileFormatError(
-            f"{path}: a camera file must be JSON (.json) or part of a COLMAP model "
-            f"({', '.join(_COLMAP_FILES)}), found neither."
+            f"{path}: must be a .json or one of COLMAP's {', '.join(_COLMAP_FILES)}, found neither."
         )
     from cvtgs.io.transforms import inria_views, transforms_views  # noqa: PLC0415
 
@@ -223,6 +222,5 @@ def _file_views(path: Path, split: Split | None) -> list[View]:
     if isinstance(content, dict) and "frames" in content:
         return transforms_views(content, path, split)
     raise FileFormatError(
-        f"{path}: must be a list of cameras (INRIA's cameras.json) or an object with 'frames' "
-        f"(transforms.json), found neither."
+        f"{path}: must be a list of cameras (INRIA's) or an object with 'frames', found neither."
     )

@@ -302,9 +302,7 @@ def _unpickled(path: Path) -> Any:
     """Load a checkpoint by memory mapping, so that only tensors that are copied are read."""
     with open_input(path) as file:
         if not zipfile.is_zipfile(file):
-            raise FileFormatError(
-                f"{path}: must be a checkpoint in the zip format of torch.save, found another."
-            )
+            raise FileFormatError(f"{path}: must be a zip as torch.save writes, found another.")
     names = set[str]()
     for name in _names_in(path):
         if not _ALLOWED.fullmatch(name):

@@ -131,8 +131,7 @@ def read_ksplat(path: Path) -> GaussianScene:
     found = sum(len(part.means) for part in parts)
     if found != count or not count:
         raise FileFormatError(
-            f"{path}: the sections must hold the {count:,} Gaussians that the header promises, "
-            f"and at least one, found {found:,}."
+            f"{path}: must hold the {count:,} Gaussians of the header, at least 1, found {found:,}."
         )
     names = ARRAY_NAMES
     joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
@@ -141,9 +140,7 @@ def read_ksplat(path: Path) -> GaussianScene:
 
 def _row_type(level: int, degree: int, path: Path) -> np.dtype[Any]:
     if degree >= len(_COMPONENTS):
-        raise FileFormatError(
-            f"{path}: must have an SH degree of at most {len(_COMPONENTS) - 1}, found {degree}."
-        )
+        raise FileFormatError(f"{path}: must have an SH degree of at most 2, found {degree}.")
     mean, half, sh = _NUMBERS[level]
     fields = [("mean", mean, 3), ("scale", half, 3), ("quat", half, 4)]
     return np.dtype([*fields, ("rgba", "u1", 4), ("sh", sh, _COMPONENTS[degree])])
@@ -172,8 +169,7 @@ def _read_section(
         bucket = _buckets(section, lengths)
         if section.bucket_bytes < 12 or bucket.max() >= section.buckets:
             raise FileFormatError(
-                f"{path}: the {section.buckets:,} buckets of a section must hold its "
-                f"{section.used:,} Gaussians, found other ones."
+                f"{path}: buckets of a section must hold {section.used:,} Gaussians, found others."
             )
         centers = extra.reshape(section.buckets, -1)[:, :12].copy().view("<f4")
         middle = section.scale_range or _RANGE

@@ -225,8 +225,7 @@ def _read_version_4(content: bytes, header: SpzHeader, path: Path | str) -> tupl
     is_whole = start >= _FOURTH_HEADER_BYTES and len(content) >= at
     if header.streams != len(sizes) or not is_whole:
         raise FileFormatError(
-            f"{path}: must hold {len(sizes)} blocks, found a table of {header.streams} at byte "
-            f"{start:,} of {len(content):,}."
+            f"{path}: must hold {len(sizes)} blocks, found a table of {header.streams} at {start}."
         )
     blocks = {"sh": np.empty(0, np.uint8)}
     entries = _TABLE_ENTRY.iter_unpack(content[start:at])

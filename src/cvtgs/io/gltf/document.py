@@ -146,8 +146,7 @@ class GltfFile:
         end = view.byteOffset + view.byteLength
         if end > len(content):
             raise self.error(
-                f"bufferViews[{index}] must end within buffer {view.buffer} of {len(content):,} "
-                f"bytes, found byte {end:,}"
+                f"bufferViews[{index}] must end within {len(content):,} bytes, found byte {end:,}"
             )
         return content[view.byteOffset : end], view.byteStride
 
@@ -175,8 +174,7 @@ class GltfFile:
         stride = stated or width
         if not width <= stride <= _MOST_STRIDE:
             raise self.error(
-                f"bufferViews[{accessor.bufferView}] must have a stride of {width} to "
-                f"{_MOST_STRIDE} bytes, found {stride:,}"
+                f"{where} must have a stride of {width} to {_MOST_STRIDE} bytes, found {stride:,}"
             )
         end = accessor.byteOffset + stride * (accessor.count - 1) + width
         if accessor.count == 0 or end > len(content):
@@ -263,8 +261,7 @@ def _chunks(content: bytes, path: Path) -> tuple[bytes, bytes | None]:
         at += CHUNK.size
         if at + size > length:
             raise FileFormatError(
-                f"{path}: a chunk must end within the {length:,} bytes of the file, found one that "
-                f"ends at byte {at + size:,}."
+                f"{path}: chunks must end within {length:,} bytes, found one until {at + size:,}."
             )
         found.setdefault(kind, content[at : at + size])
         at += size

@@ -206,13 +206,11 @@ def header_bytes(comments: Iterable[str], elements: Iterable[tuple[str, int, Lay
         header = "\n".join([*lines, "end_header", ""]).encode()
     except UnicodeEncodeError as error:
         raise InvalidSceneError(
-            f"comments and names of columns must be Unicode text to be written to a PLY, found "
-            f"{shown(error.object[error.start])}."
+            f"comments and columns must be Unicode text, found {shown(error.object[error.start])}."
         ) from None
     if len(header) > MAX_HEADER_BYTES:
         raise InvalidSceneError(
-            f"comments and names of columns must take at most {MAX_HEADER_BYTES:,} bytes to be "
-            f"written to a PLY, found {len(header):,}."
+            f"a PLY header must take at most {MAX_HEADER_BYTES:,} bytes, found {len(header):,}."
         )
     return header
 

@@ -127,8 +127,7 @@ def _check_names(scene: GaussianScene) -> None:
             )
         if name.split() != [name] or not is_name(name):
             raise InvalidSceneError(
-                f"extra column {shown(name)} must have a name of at most {MAX_NAME_LETTERS} "
-                f"letters without blanks to be written to a PLY."
+                f"column {shown(name)} must have no blanks, at most {MAX_NAME_LETTERS} letters."
             )
     for name, kind in scene.layout:
         if kind not in SCALARS:
@@ -146,8 +145,7 @@ def _extra_type(name: str, column: Tensor, kind: str | None) -> str:
             if _fits(column, wide):
                 return wide
         raise InvalidSceneError(
-            f"extra column {name!r} must fit into 32 bits to be written to a PLY, "
-            f"found values from {column.min()} to {column.max()}."
+            f"extra column {name!r} must fit into 32 bits, found {column.min()} to {column.max()}."
         )
     if column.dtype not in _NATURAL_TYPES:
         raise InvalidSceneError(

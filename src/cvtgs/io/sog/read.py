@@ -200,9 +200,7 @@ def _read_meta(content: Any, where: str) -> _Meta:
     is_first = (validated(_Root, content, where).version or 1) == 1
     meta = (_meta_of_version_1 if is_first else _meta_of_version_2)(content, where)
     if not 0 < meta.count <= _MOST_COUNT:
-        raise FileFormatError(
-            f"{where}: a SOG must hold 1 to {_MOST_COUNT:,} Gaussians, found {meta.count:,}."
-        )
+        raise FileFormatError(f"{where}: 'count' must be 1 to {_MOST_COUNT:,}, found {meta.count}.")
     return meta
 
 
@@ -346,8 +344,7 @@ def _read_inside(archive: zipfile.ZipFile, path: Path, name: str, most: int) -> 
         # of other methods, zipfile unpacks blocks whole
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise FileFormatError(
-                f"{where} must be stored or deflated in the zip, found method "
-                f"{entry.compress_type}; zip the images again."
+                f"{where} must be stored or deflated, found {entry.compress_type}; zip it again."
             )
         _check_length(entry.file_size, most, where)
         with archive.open(entry) as member:
