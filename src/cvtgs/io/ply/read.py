@@ -321,21 +321,20 @@ def open_rows(
     if sh_degree is not None:
         check_degree(sh_degree)
     name = os.fspath(path)
+    refusal = FileFormatError(
+        f"{name}: only binary little endian PLY files with vertices first can be read in parts; "
+        f"write one with cvtgs convert."
+    )
     with open_input(Path(path)) as file:
         if file.read(3) != b"ply":
-            raise FileFormatError(
-                f"{name}: only PLY files can be read in parts; write one with cvtgs convert."
-            )
+            raise refusal
         file.seek(0)
         header = read_header(file, name)
         size = os.fstat(file.fileno()).st_size
     vertex = find_vertices(header, name)
     check_size(header, vertex, path=name, size=size)
     if not can_map(header):
-        raise FileFormatError(
-            f"{name}: only binary little endian PLY files with vertices first can be read in "
-            f"parts; write one with cvtgs convert."
-        )
+        raise refusal
     return PlyRows(
         path=str(Path(name).absolute()),  # for workers in other folders
         count=vertex.count,
