@@ -35,6 +35,10 @@ class Box(pydantic.BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         min: Least coordinates, scene units.
         max: Largest coordinates, none below those of ``min``.
 
+    Raises:
+        InvalidArgumentError: A corner does not consist of three finite numbers, or ``min`` is above
+            ``max``.
+
     Example:
         >>> Box(min=(0, 0, 0), max=(1, 1, 1)).max
         (1.0, 1.0, 1.0)
@@ -73,6 +77,9 @@ class Sphere:
         center: Centre, scene units.
         radius: Radius, scene units, at least 0.
 
+    Raises:
+        InvalidArgumentError: A number is not finite, or the radius is negative.
+
     Example:
         >>> Sphere(center=(0.0, 0.0, 0.0), radius=1.0).radius
         1.0
@@ -97,6 +104,14 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
 
     Args:
         path: A file that holds ``{"min": [x, y, z], "max": [x, y, z]}``, or a list of these.
+
+    Returns:
+        The boxes, at least one.
+
+    Raises:
+        InputNotFoundError: There is no such file.
+        InputError: The file cannot be read.
+        InvalidArgumentError: The file holds something else, or ``path`` is no path.
 
     Example:
         >>> import tempfile
@@ -133,6 +148,17 @@ def inside(
     regions: Sequence[Box | Sphere] | Box | Sphere, means: Float[Tensor, "n 3"]
 ) -> Bool[Tensor, "n"]:
     """Return a mask of the centres that lie in any of some boxes and spheres.
+
+    Args:
+        regions: The boxes and spheres, or a single one.
+        means: Positions, scene units.
+
+    Returns:
+        The mask.
+
+    Raises:
+        InvalidArgumentError: A region is something else, or positions are no floats of shape
+            ``(n, 3)``.
 
     Example:
         >>> box = Box(min=(0, 0, 0), max=(1, 1, 1))

@@ -103,7 +103,13 @@ class Cameras:
         """Return some of the cameras, as ``cameras[rows]`` does.
 
         Args:
-            rows: A slice, indices of the cameras, or a mask with one entry per camera.
+            rows: A slice, indices of the cameras, or a mask.
+
+        Returns:
+            The selected cameras.
+
+        Raises:
+            InvalidArgumentError: A mask has not one entry per camera, or an index is out of range.
         """
         device = rows.device if isinstance(rows, Tensor) else torch.device("cpu")
         chosen = row_numbers(rows, len(self), things="cameras", device=device)
@@ -123,12 +129,33 @@ class Cameras:
         return [self[[row]] for row in range(len(self))]
 
     def to(self, device: torch.device | str) -> Self:
-        """Return the cameras on a device."""
+        """Move the cameras to a device.
+
+        Args:
+            device: The target device.
+
+        Returns:
+            The cameras on that device.
+
+        Raises:
+            DeviceError: The device cannot be used.
+        """
         target = usable_device(device)
         return replace(self, viewmats=self.viewmats.to(target), Ks=self.Ks.to(target))
 
     def resized(self, width: int, height: int) -> Self:
-        """Return cameras with the same field of view and another image size, pixels."""
+        """Return cameras with the same field of view and another image size.
+
+        Args:
+            width: Image width, pixels.
+            height: Image height, pixels.
+
+        Returns:
+            Cameras with scaled intrinsics.
+
+        Raises:
+            InvalidArgumentError: A length is no whole number above 0.
+        """
         width = checked_whole(width, "width")
         height = checked_whole(height, "height")
         factors = self.Ks.new_tensor([width / self.width, height / self.height, 1.0])
@@ -140,6 +167,12 @@ class Cameras:
         Args:
             side: Longer side of the images, pixels.
             least: Smallest length of either side, pixels.
+
+        Returns:
+            Cameras with scaled intrinsics.
+
+        Raises:
+            InvalidArgumentError: A length is no whole number above 0.
         """
         side = checked_whole(side, "side")
         least = checked_whole(least, "least")
@@ -199,6 +232,12 @@ class Cameras:
 
         Args:
             factor: Ratio of the two sizes; 1 changes nothing.
+
+        Returns:
+            The same cameras otherwise.
+
+        Raises:
+            InvalidArgumentError: The factor is no whole number above 0.
         """
         factor = checked_whole(factor, "factor")
         if factor == 1:
@@ -223,7 +262,17 @@ class Cameras:
     @without_autocast()
     @checked
     def shows_any(self, points: Float[Tensor, "n 3"]) -> bool:
-        """Return whether any point is within an image, and at least 0.01 before its camera."""
+        """Check whether any point lies within any of the images.
+
+        Args:
+            points: Positions in the units of the cameras.
+
+        Returns:
+            Whether one is at least 0.01 before a camera (the near plane) and within its image.
+
+        Raises:
+            InvalidArgumentError: ``points`` is no tensor of floats of this shape.
+        """
         scales = view_scales(self.viewmats).to(points)[:, None, None]
         for view, matrix in zip(self.viewmats.to(points) / scales, self.Ks.to(points), strict=True):
             x, y, depth = matrix @ (view[:3, :3] @ points.T + view[:3, 3:])
@@ -233,7 +282,17 @@ class Cameras:
         return False
 
     def spread(self, count: int) -> Self:
-        """Return some of the cameras, evenly spaced in their order; all if there are no more."""
+        """Return some of the cameras, evenly spaced in their order.
+
+        Args:
+            count: Number of cameras, at least 1; all are returned if there are no more.
+
+        Returns:
+            The selected cameras.
+
+        Raises:
+            InvalidArgumentError: The count is no whole number above 0.
+        """
         return self.select(spread_rows(len(self), checked_whole(count, "count")))
 
 

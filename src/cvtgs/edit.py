@@ -33,6 +33,10 @@ class Motion:
         scale: Factor of all lengths, above 0.
         shift: Translation, scene units, applied last.
 
+    Raises:
+        InvalidArgumentError: A number is not finite, the factor is not above 0, or the quaternion
+            is too short or too long.
+
     Example:
         >>> Motion(scale=2.0).shift
         (0.0, 0.0, 0.0)
@@ -60,7 +64,19 @@ class Motion:
     def of_angles(
         cls, angles: Corner, *, scale: float = 1.0, shift: Corner = _NO_SHIFT
     ) -> "Motion":
-        """Build a motion from degrees about x, then y, then z; the axes are fixed (extrinsic)."""
+        """Build a motion from angles.
+
+        Args:
+            angles: Degrees about x, then y, then z; the axes are fixed (extrinsic rotations).
+            scale: Factor of all lengths.
+            shift: Translation.
+
+        Returns:
+            The motion.
+
+        Raises:
+            InvalidArgumentError: A number is not finite, or the factor is not above 0.
+        """
         degrees = finite_numbers(angles, 3)
         if degrees is None:
             raise InvalidArgumentError(
@@ -85,10 +101,18 @@ def _cos_sin(degrees: float) -> tuple[float, float]:
 
 @checked
 def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -> GaussianScene:
-    """Keep the Gaussians whose centres lie in any region; centres with NaN lie in none.
+    """Keep the Gaussians whose centres lie in a region; centres with NaN lie in none.
+
+    Args:
+        scene: The scene; it is not changed.
+        regions: A box or sphere, or several; Gaussians in any of them are kept.
 
     Returns:
         The kept Gaussians, in their order, bit for bit; the same object if all are kept.
+
+    Raises:
+        InvalidArgumentError: There is no region, one is neither a box nor a sphere, or ``scene`` is
+            no scene.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -104,10 +128,17 @@ def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -
 
 @checked
 def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
-    """Drop the Gaussians below an opacity, 0 to 1; invalid ones stay.
+    """Drop the Gaussians below an opacity; invalid ones stay.
+
+    Args:
+        scene: The scene; it is not changed.
+        least: Smallest opacity to keep, 0 to 1.
 
     Returns:
         The others, in their order, bit for bit; the same object if none is dropped.
+
+    Raises:
+        InvalidArgumentError: The opacity is not from 0 to 1, or ``scene`` is no scene.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -125,10 +156,17 @@ def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
 
 @checked
 def drop_large(scene: GaussianScene, largest: float) -> GaussianScene:
-    """Drop the Gaussians above a size, a standard deviation in scene units; invalid ones stay.
+    """Drop the Gaussians above a size; invalid ones stay.
+
+    Args:
+        scene: The scene; it is not changed.
+        largest: Largest standard deviation to keep, scene units, above 0.
 
     Returns:
         The others, in their order, bit for bit; the same object if none is dropped.
+
+    Raises:
+        InvalidArgumentError: The size is not above 0, or ``scene`` is no scene.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -152,12 +190,17 @@ def _kept(scene: GaussianScene, keep: Tensor) -> GaussianScene:
 def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
     """Rotate, scale and translate a scene; view-dependent colours and normals rotate with it.
 
+    Args:
+        scene: The scene; it is not changed.
+        motion: The transform.
+
     Returns:
         The moved scene. Only tensors that change are computed: a translation changes the centres
         alone, a scale factor the centres and scales alone.
 
     Raises:
-        InvalidArgumentError: Coordinates would leave the range of the dtype or shrink to 0.
+        InvalidArgumentError: Coordinates would leave the range of the dtype or shrink to 0, or an
+            argument has another type.
 
     Example:
         >>> from cvtgs.synthetic import scene as make

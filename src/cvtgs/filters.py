@@ -43,7 +43,15 @@ def filter_rows(
     """Drop faint Gaussians and flyaways, but keep at least the target number of Gaussians.
 
     All faint Gaussians are dropped; where they hold much mass together (haze), only the faintest.
-    Rows of the scene must be valid.
+
+    Args:
+        scene: The Gaussians; all rows must be valid.
+        analysis: Areas and effect plan of the scene.
+        target: Minimum number of Gaussians to keep.
+        config: Thresholds.
+
+    Returns:
+        The rows that stay, and statistics of the dropped ones.
 
     Raises:
         InvalidArgumentError: The analysis is of another scene, or ``target`` is outside 1 to n.
@@ -109,6 +117,9 @@ def visible_rows(
         at_least: If fewer than this many would stay, the heaviest of the dropped ones stay too,
             those first that images can show.
 
+    Returns:
+        Mask of the Gaussians that stay.
+
     Raises:
         InvalidArgumentError: Shapes do not fit together, a number is out of range, or (on the host)
             an opacity is not from 0 to 1.
@@ -160,6 +171,9 @@ def flyaway_rows(
         distances: Distances from the middle of the scene, in robust radii.
         masses: Masses as seen from the middle.
         max_share: Share of the total mass up to which the lightest far Gaussians are flyaways.
+
+    Returns:
+        Mask of the flyaways.
 
     Raises:
         InvalidArgumentError: Shapes do not fit together, or ``max_share`` is not from 0 to 1.

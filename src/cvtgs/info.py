@@ -76,6 +76,9 @@ def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInf
         scene: Any scene, or a file or folder of one.
         config: Configuration to plan the effects for; None for the default one.
 
+    Returns:
+        The facts.
+
     Raises:
         InvalidSceneError: The scene has no valid row.
         InvalidArgumentError: The configuration is no SimplifyConfig.

@@ -59,7 +59,14 @@ class LevelEntry(Record):
     alpha_bias: float | None = None
 
     def with_scores(self, scores: SceneScores) -> Self:
-        """Return the entry with the scores of its file."""
+        """Return the entry with scores.
+
+        Args:
+            scores: Scores of the file.
+
+        Returns:
+            A new entry.
+        """
         return self.model_copy(update=scores.means())
 
 

@@ -161,9 +161,16 @@ def group_and_merge(  # noqa: PLR0913 (options by name)
 ) -> tuple[Merged, cells.Partition, CellStatistics]:
     """Run the stages before the network: filter, weigh, tessellate, allocate, merge.
 
-    Arguments are as for :func:`reduce_scene`, but the scene has more than ``target`` Gaussians, and
-    no bands that the plan drops; ``with_network`` says whether a network needs the neighbours, and
-    ``origin`` is subtracted from positions before cells merge.
+    Args:
+        scene: The Gaussians, without bands that the plan drops; more than ``target`` of them.
+        analysis: Their analysis.
+        target: Number of Gaussians to keep.
+        config: The configuration.
+        with_network: Whether a network needs the neighbours.
+        clock: Measures each stage.
+        ordered: As for :func:`reduce_scene`.
+        importance: As for :func:`reduce_scene`.
+        origin: Point that is subtracted from positions before cells merge; None for none.
 
     Returns:
         One Gaussian per cell, the rows that make up every cell, and statistics.
@@ -226,6 +233,9 @@ def merge_and_inflate(
         clamping: Whether merged colours make up for members with colours below zero.
         with_network: Whether a network needs the neighbours.
         on_cells: Called with the number of finished cells.
+
+    Returns:
+        One Gaussian per cell.
     """
     merged, represented = merge_members(
         scene, partition, config, areas=areas, clamping=clamping, on_cells=on_cells

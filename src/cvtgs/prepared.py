@@ -53,6 +53,17 @@ class Prepared:
 
     ``Simplifier.prepare`` creates instances. Every run gives the bits of ``Simplifier.run``; the
     report of the first run includes the shared stages.
+
+    Args:
+        scene: The input scene.
+        config: The configuration.
+        checkpoint: Checkpoint of the network that corrects merged Gaussians; None for no network.
+        device: Device to compute on; None chooses as ``auto`` does.
+        cameras: Cameras for presets that render the scene; None generates views.
+        listener: Called with progress events.
+
+    Raises:
+        InvalidArgumentError: There are too few cameras for a preset that renders the scene.
     """
 
     def __init__(
@@ -149,7 +160,11 @@ class Prepared:
         return self._result(reduced, checked, analysis, target, clock, kept_count=len(protected))
 
     def warm_up(self, rho: float) -> None:
-        """Cache in advance what the second run would cache, up to the largest ratio to expect."""
+        """Compute and cache in advance the results that the second run would cache.
+
+        Args:
+            rho: The largest ratio to expect.
+        """
         target = target_count(len(self._scene), rho)
 
         def compute() -> None:

@@ -233,13 +233,31 @@ class GaussianScene:
         axes: str | None = None,
         spz_version: Literal[2, 3, 4] = 3,
     ) -> None:
-        """Write the scene to a file; arguments and errors as for :func:`cvtgs.save`."""
+        """Write the scene to a file, as :func:`cvtgs.save` does.
+
+        Args:
+            path: Path of the file, whose suffix chooses the format, or an open binary file.
+            format: Suffix of the format, if the file name does not have it.
+            overwrite: Whether an existing file may be replaced.
+            axes: Directions of x, y and z in the file; None for the axes of the format.
+            spz_version: Version of the format in a ``.spz``: 2, 3 or 4, as for :func:`cvtgs.save`.
+        """
         resolve_name("cvtgs.io.formats:save")(
             self, path, format=format, overwrite=overwrite, axes=axes, spz_version=spz_version
         )
 
     def with_sh_degree(self, degree: int) -> Self:
-        """Drop the SH bands above a degree, 0 to 3; return the same object if there are none."""
+        """Drop the SH bands above a degree, which makes files of the scene smaller.
+
+        Args:
+            degree: 0 to 3.
+
+        Returns:
+            The same Gaussians with fewer bands; the same object if there are none above the degree.
+
+        Raises:
+            InvalidArgumentError: The degree is not from 0 to 3.
+        """
         if whole_number(degree) not in range(len(spherical_harmonics.REST_COUNTS)):
             raise InvalidArgumentError(f"the SH degree must be from 0 to 3, found {degree!r}.")
         if degree >= self.sh_degree:
@@ -260,6 +278,12 @@ class GaussianScene:
             tensors: Some or all of the six standard tensors by name.
             extras: All extra columns; None for those of this scene.
             named: Standard tensors by keyword: ``scene.with_tensors(sh0=colors)``.
+
+        Returns:
+            The new scene.
+
+        Raises:
+            InvalidSceneError: A tensor name is unknown, or tensors do not fit together.
         """
         if not isinstance(tensors, Mapping | None):
             raise InvalidSceneError(f"tensors must be a mapping by name, found {shown(tensors)}.")
@@ -274,7 +298,17 @@ class GaussianScene:
         return replace(self, **changes)
 
     def to(self, device: torch.device | str) -> Self:
-        """Return the scene on a device: the same object if it is already there, else a copy."""
+        """Move the scene to a device.
+
+        Args:
+            device: The target device.
+
+        Returns:
+            The same object if it is already there, else a copy.
+
+        Raises:
+            DeviceError: The device cannot be used.
+        """
         target = usable_device(device)
         if target == self.device:
             return self

@@ -100,9 +100,8 @@ class Simplifier:
             InvalidSceneError: The scene has no valid row.
             InputError, FileFormatError: A path cannot be read, as for :func:`cvtgs.load`.
         """
-        return self.run(
-            scene, rho, count=count, max_count=max_count, cameras=cameras, keep=keep
-        ).scene
+        prepared = self.prepare(scene, cameras=cameras)
+        return prepared.run(rho, count=count, max_count=max_count, keep=keep).scene
 
     def run(
         self,
@@ -114,7 +113,11 @@ class Simplifier:
         cameras: Cameras | None = None,
         keep: MaskLike | None = None,
     ) -> Simplified:
-        """Simplify a scene, and report; arguments and errors as for :meth:`simplify`."""
+        """Simplify a scene, and report; arguments and errors as for :meth:`simplify`.
+
+        Returns:
+            The scene and the report.
+        """
         return self.prepare(scene, cameras=cameras).run(
             rho, count=count, max_count=max_count, keep=keep
         )
@@ -125,7 +128,7 @@ class Simplifier:
         """Simplify a scene to several levels, in less time than separate runs.
 
         Every level equals the result of :meth:`run` at its ratio, bit for bit; what does not depend
-        on the ratio is computed once. Errors are as for :meth:`simplify`.
+        on the ratio is computed once.
 
         Args:
             scene: The scene, which is not changed, or the path of its file or folder.
@@ -133,7 +136,11 @@ class Simplifier:
             cameras: Cameras for presets that render the scene; None finds or generates views.
 
         Returns:
-            One level per ratio, in the order of the ratios.
+            One level per ratio, in the order of the ratios, of exactly ``ceil(rho * N)`` Gaussians.
+
+        Raises:
+            InvalidArgumentError: A ratio is out of range, or there is none.
+            InvalidSceneError: The scene has no valid row.
 
         Example:
             >>> from cvtgs.synthetic import scene as make
@@ -153,6 +160,12 @@ class Simplifier:
                 use, or the path of its file or folder.
             cameras: Cameras for presets that render the scene; None takes those beside the file or
                 in the folder (:func:`cvtgs.views.find_own_cameras`), or else generates views.
+
+        Returns:
+            The prepared scene.
+
+        Raises:
+            InvalidArgumentError: It is neither a scene nor a path, or ``cameras`` are none.
 
         Example:
             >>> from cvtgs.synthetic import scene as make
@@ -201,7 +214,9 @@ def simplify(
     preset: str = "standard",
     device: str | torch.device = "auto",
 ) -> GaussianScene:
-    """Simplify a scene, as :meth:`Simplifier.simplify`, which has more options.
+    """Simplify a scene.
+
+    :class:`cvtgs.Simplifier` does the same, with more options and a report.
 
     Args:
         scene: The scene, or the path of a file or folder that :func:`cvtgs.load` reads.
@@ -216,8 +231,12 @@ def simplify(
         leave fewer.
 
     Raises:
+        InputError: The file is missing (:class:`cvtgs.errors.InputNotFoundError`) or unreadable.
+        FileFormatError: The file violates its format.
         ConfigError: There is no such preset.
-        CvtgsError: As for :class:`Simplifier` and its method.
+        DeviceError: The device cannot be used.
+        InvalidArgumentError: Ratio or count is out of range, or not exactly one is given.
+        InvalidSceneError: The scene has no valid row.
 
     Example:
         >>> from cvtgs.synthetic import scene as make

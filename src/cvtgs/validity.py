@@ -43,6 +43,12 @@ class CheckedScene(NamedTuple):
 def check_rows(scene: GaussianScene) -> CheckedScene:
     """Drop invalid rows (:func:`invalid_rows`), and warn about them.
 
+    Args:
+        scene: The Gaussians.
+
+    Returns:
+        The valid rows, and counts of the dropped ones.
+
     Raises:
         InvalidSceneError: No row is valid.
 
@@ -83,12 +89,18 @@ def _listed(reasons: Mapping[str, int]) -> str:
 
 
 def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
-    """Find the rows that no renderer can draw: one mask per attribute that has bad rows.
+    """Find the rows that no renderer can draw.
 
     NaN or infinite means, scales and SH coefficients, NaN opacities, and quaternions that are
     zero, NaN or infinite are invalid. Means and scales beyond float32 count as infinite.
     Log-scales of minus infinity, which are scales of 0, are invalid too. Infinite opacity logits
     are valid.
+
+    Args:
+        scene: Any scene.
+
+    Returns:
+        One mask per attribute that has bad rows; empty for a clean scene.
 
     Example:
         >>> from cvtgs.synthetic import scene
@@ -154,7 +166,11 @@ def with_finite_opacities(scene: GaussianScene) -> GaussianScene:
 def standardized(scene: GaussianScene) -> GaussianScene:
     """Clamp opacities to strictly inside (0, 1), and scales to finite ones; normalize quaternions.
 
-    Rows must be valid; those that already satisfy this are unchanged, bit for bit.
+    Args:
+        scene: A scene with valid rows.
+
+    Returns:
+        The scene; rows that already satisfy this are unchanged, bit for bit.
 
     Example:
         >>> from cvtgs.synthetic import scene as make

@@ -96,9 +96,15 @@ class SceneAnalysis:
 def analyze(
     scene: GaussianScene, config: SimplifyConfig, *, with_visibility: bool = False
 ) -> SceneAnalysis:
-    """Analyze a scene, whose rows must be valid, without rendering it.
+    """Analyze a scene without rendering it.
 
-    The ambient visibility is computed if weights or, ``with_visibility``, a network need it.
+    Args:
+        scene: The Gaussians; all rows must be valid.
+        config: The configuration.
+        with_visibility: Whether a network needs the ambient visibility.
+
+    Returns:
+        Frame, areas, visibility and effect plan.
 
     Raises:
         InvalidArgumentError: An argument has another type, or the scene is empty.

@@ -113,6 +113,9 @@ def plan_effects(
         config: Overrides of the decisions, and the thresholds of the filter; None for the
             defaults.
 
+    Returns:
+        The plan.
+
     Raises:
         InvalidArgumentError: Tensors have different lengths.
 
@@ -279,7 +282,12 @@ def select_columns(scene: GaussianScene, choices: EffectsConfig) -> GaussianScen
 def drop_unused_bands(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
     """Drop the SH bands that a scene does not call for, and a tag mip that is switched off.
 
-    Bands are copied; the same object is returned if nothing changes.
+    Args:
+        scene: The scene that the plan was made for.
+        plan: The effect plan.
+
+    Returns:
+        The scene with a copy of the remaining bands; the same object if nothing changes.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -302,8 +310,15 @@ def drop_mip_tag(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
 def restore_columns(small: GaussianScene, scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
     """Restore the SH degree, the comments and the flatness of the input in a small scene.
 
-    Dropped bands are zeros. If the Gaussians of ``scene`` have two scales, third ones are
-    negligible, unless the plan makes them thick; then the tag 2dgs is left out.
+    Args:
+        small: The small scene, with the bands that were computed.
+        scene: The input scene.
+        plan: The effect plan of the input scene.
+
+    Returns:
+        The small scene with the SH degree and the comments of ``scene``: dropped bands are zeros.
+        If the Gaussians of ``scene`` have two scales, third ones are negligible, unless the plan
+        makes them thick; then the tag 2dgs is left out.
 
     Example:
         >>> from cvtgs.synthetic import scene as make

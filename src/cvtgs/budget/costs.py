@@ -208,9 +208,14 @@ class CostModel(Record, allow_inf_nan=False):
         return cls(rates=rates, start=start, image_start=image_start)
 
     def stage_seconds(self, work: Work, config: SimplifyConfig) -> dict[str, float]:
-        """Predict the wall-clock seconds of each stage that a configuration has.
+        """Predict the cost of each stage that a configuration has.
 
-        A scene that stays whole is only checked and analysed.
+        Args:
+            work: Size of the simplification.
+            config: Configuration of the simplification.
+
+        Returns:
+            Wall-clock seconds by stage; a scene that stays whole is only checked and analysed.
         """
         is_whole = work.target >= work.count
         optional = {
@@ -230,9 +235,15 @@ class CostModel(Record, allow_inf_nan=False):
         return seconds
 
     def seconds(self, work: Work, config: SimplifyConfig) -> float:
-        """Predict the wall-clock seconds of the first simplification of a process.
+        """Predict the cost of a simplification.
 
-        They are those from the scene in memory to the small scene in memory.
+        Args:
+            work: Size of the simplification.
+            config: Configuration of the simplification.
+
+        Returns:
+            Wall-clock seconds of the first simplification of a process, from the scene in memory
+            to the small scene in memory.
 
         Example:
             >>> model = CostModel(rates={"check": {"in": 4e-6, "in_values": 0.0}}, start=0.5)

@@ -133,6 +133,9 @@ def find_count(
             is read back from a file whose format rounds. The result is not rounded.
         listener: Called with progress events.
 
+    Returns:
+        The scene, and all counts that were tried.
+
     Raises:
         GoalError: Even nine tenths of the valid Gaussians do not reach it; the message names the
             best result.

@@ -57,9 +57,16 @@ def merge_pairs(
     the number of Gaussians, which keeps groups balanced. The contrast of neighbouring groups
     scales the power and the weight of colour; far mass lowers the power. Pairs that would be seen
     at a wide angle cost more, and so do heavy ones where much mass is far, and far ones where less
-    of the far mass is hidden than of the near mass; that depends on the ``area`` of all groups,
-    their apparent mass in squared robust radii, if it is known. Where no neighbours are left to
-    merge, groups of adjacent rows do.
+    of the far mass is hidden than of the near mass. Where no neighbours are left to merge, groups
+    of adjacent rows do.
+
+    Args:
+        groups: Moments of the groups.
+        neighbors: Groups that each group may merge with.
+        count: Number of groups to keep, 1 to m.
+        config: Weights of the cost.
+        area: Apparent mass of all groups, squared robust radii; None if it is not known, and far
+            mass is taken to be as hidden as near mass.
 
     Returns:
         The new group of every group, 0 to ``count - 1``.
@@ -294,9 +301,19 @@ def reassign(
     """Move every member once to the group that explains it best, its own or a neighbouring one.
 
     The fit is the Kullback-Leibler divergence of the two Gaussians plus the squared distance of
-    their colours, of the weight in ``config``. The best-fitting member of each group that
-    ``must_stay`` (None for all) stays, so that no group with members becomes empty; groups without
-    members may gain some. Returns the new group of every member.
+    their colours. The best-fitting member of each group stays, so that no group with members
+    becomes empty.
+
+    Args:
+        members: Moments of the members.
+        labels: Group of each.
+        groups: Moments of the groups; groups without members may gain some.
+        neighbors: Other groups that the members of each group may move to.
+        config: Weight of colour.
+        must_stay: Groups that must keep a member; None for all.
+
+    Returns:
+        The new group of every member.
 
     Example:
         >>> from cvtgs.cells.moments import group_moments

@@ -102,8 +102,12 @@ def describe_cells(
         cells: Row numbers of these cells in ``merged``.
         neighbors: The nearest other cells of each of these cells.
         sizes: Number of members of every cell, for all cells.
-        visibility: Result of :func:`cvtgs.analysis.ambient_visibility`.
+        visibility: Ambient visibility of every Gaussian of the scene, 0 to 1
+            (:func:`cvtgs.analysis.ambient_visibility`).
         pixel_size: Size of a pixel in the middle of the scene, scene units.
+
+    Returns:
+        The descriptors, in the dtype of the scene.
 
     Example:
         >>> from cvtgs.cells import merge_cells

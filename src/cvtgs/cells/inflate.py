@@ -117,6 +117,9 @@ def inflate_cells(
         everywhere: Growth of an opaque cell of 100 members along every axis.
         covered: Further growth along an axis that is covered at both ends.
 
+    Returns:
+        The scene with larger scales.
+
     Example:
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 2, sh_degree=0, seed=0)

@@ -245,12 +245,18 @@ def keep_representatives(
 
     Members that lie apart (points, needles, thin haze) have moments far wider than the members
     together: the merged Gaussian is a faint veil that shows less in an image than any member. A
-    member of opacity a and mean projected area A removes about ``a^2 A`` of the squared error of an
-    image; a Gaussian that spreads the mass M of the cell over its area A removes ``M^2 / A``. So
-    the member of largest ``a^2 A`` is kept, bit for bit, where that is more. It is also kept where
-    it has more than ``DOMINANT`` of the mass: moments would hardly differ, but a very wide sky
-    Gaussian that moves from behind a camera to before it covers its image as fog. Our own rules,
-    not part of CVT-GS.
+    member of opacity a and area A removes about ``a^2 A`` of the squared error of an image; a
+    Gaussian that spreads the mass M of the cell over its area A removes ``M^2 / A``. So the member
+    of largest ``a^2 A`` is kept, bit for bit, where that is more. It is also kept where it has more
+    than ``DOMINANT`` of the mass: moments would hardly differ, but a very wide sky Gaussian that
+    moves from behind a camera to before it covers its image as fog. Our own rules, not part of
+    CVT-GS.
+
+    Args:
+        scene: The Gaussians.
+        merged: One Gaussian per cell, from its moments.
+        partition: Members of the cells.
+        areas: Mean projected areas of all Gaussians of the scene.
 
     Returns:
         The scene with these members in place of their cells, and the members that each of its

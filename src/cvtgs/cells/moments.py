@@ -61,19 +61,31 @@ def gaussian_moments(
     components: Float[Tensor, "c k"] | None = None,
     unit: float | None = None,
 ) -> Moments:
-    """Return the moments of single Gaussians, in the order of their rows, in robust radii.
+    """Return the moments of single Gaussians.
 
-    Masses, and those as seen in images, are divided by ``unit``; None divides each by its mean, or
-    a million medians if that is less. ``components`` is the result of :func:`view_components`; None
-    for no view-dependent colour.
+    Args:
+        scene: The Gaussians.
+        rows: Row numbers of the Gaussians to use.
+        frame: Centre and radius of the scene; the radius is the unit of length.
+        masses: Mass of each.
+        apparent_masses: Mass of each as seen in images.
+        components: Result of :func:`view_components`; None for no view-dependent colour.
+        unit: Divisor of both masses; None divides each by its mean, or a million medians
+            if that is less.
+
+    Returns:
+        The moments, in the order of the rows.
 
     Example:
         >>> from cvtgs.math.frames import robust_frame
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 100, seed=0)
         >>> moments = gaussian_moments(
-        ...     scene, torch.arange(100), robust_frame(scene.means),
-        ...     masses=scene.masses, apparent_masses=scene.masses,
+        ...     scene,
+        ...     torch.arange(100),
+        ...     robust_frame(scene.means),
+        ...     masses=scene.masses,
+        ...     apparent_masses=scene.masses,
         ... )
         >>> moments.means.shape, moments.covariances.shape
         (torch.Size([3, 100]), torch.Size([6, 100]))
@@ -123,9 +135,15 @@ def mass_unit(masses: Float[Tensor, "n"], mean: Tensor | float) -> Float[Tensor,
 
 @checked
 def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Moments:
-    """Return the moments of ``count`` groups by the labels of their members; none is empty.
+    """Return the moments of groups; the spread of means is computed about the mean of the group.
 
-    The spread of means is computed about the mean of the group.
+    Args:
+        members: Moments of the members.
+        labels: Group of each, 0 to ``count - 1``; none is empty.
+        count: Number of groups, m.
+
+    Returns:
+        Moments of the groups.
 
     Example:
         >>> ones, x = torch.ones(2), torch.tensor([[0.0, 2.0], [0.0, 0.0], [0.0, 0.0]])
@@ -196,8 +214,12 @@ def view_components(
     neighbours share. In others they are mostly noise of the training, which makes neighbours look
     different where images do not. So the components are principal ones, and each counts by the
     share of its variance that is common to neighbours: the variance minus half of the mean squared
-    difference of neighbours (the nugget of a variogram, Matheron 1963), over the variance. Rows are
-    in the order of a space-filling curve, and masses as seen in images.
+    difference of neighbours (the nugget of a variogram, Matheron 1963), over the variance.
+
+    Args:
+        scene: The Gaussians.
+        rows: Row numbers, in the order of a space-filling curve.
+        masses: Mass of each as seen in images.
 
     Returns:
         The matrix that maps the coefficients of a Gaussian, flattened, to its components; float64,

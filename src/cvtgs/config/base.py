@@ -56,6 +56,12 @@ class Section(pydantic.BaseModel):
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read a TOML file; a byte order mark, as editors on Windows write it, is skipped.
 
+    Args:
+        path: The file.
+
+    Returns:
+        The tables of the file.
+
     Raises:
         ConfigError: The file cannot be read, or is not TOML.
         InvalidArgumentError: ``path`` is no path.

@@ -188,7 +188,13 @@ class SimplifyConfig(Section):
 
     @classmethod
     def from_preset(cls, name: str) -> Self:
-        """Return one of :data:`cvtgs.config.PRESETS`.
+        """Return a preset.
+
+        Args:
+            name: One of :data:`cvtgs.config.PRESETS`.
+
+        Returns:
+            The configuration.
 
         Raises:
             ConfigError: There is no such preset.
@@ -212,7 +218,13 @@ class SimplifyConfig(Section):
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
-        """Read a configuration file in TOML; missing keys come from its preset.
+        """Read a configuration file.
+
+        Args:
+            path: A TOML file with the keys of this class; missing keys come from its preset.
+
+        Returns:
+            The configuration.
 
         Raises:
             ConfigError: The file cannot be read, is not TOML, or holds a bad key or value.

@@ -66,8 +66,15 @@ def gaussian_weights(
     """Return opacity times area to a power: 0 is the opacity as in CVT-GS, 1 the mass.
 
     The mass estimates how much of an image a Gaussian paints. A power below 1 gives more cells to
-    small Gaussians, which carry fine texture, at the expense of large, smooth surfaces. Areas have
-    any unit; weights are float64.
+    small Gaussians, which carry fine texture, at the expense of large, smooth surfaces.
+
+    Args:
+        opacities: Opacities.
+        areas: Mean projected areas, any unit.
+        area_power: The power, at least 0.
+
+    Returns:
+        Weights in float64.
 
     Raises:
         InvalidArgumentError: ``area_power`` is negative or not finite, or shapes or types do not
@@ -86,10 +93,19 @@ def gaussian_weights(
 def tessellation_weights(
     opacities: Float[Tensor, "n"], areas: Float[Tensor, "n"], *, area_power: float, floor: float
 ) -> Float[Tensor, "n"]:
-    """Return the weights of :func:`gaussian_weights` with mean 1, none below a floor.
+    """Return the weight of every Gaussian.
 
-    Areas are possibly as seen from the middle of the scene. Weights are float64; 1 everywhere if
-    all would be 0, or one is NaN.
+    The weights of :func:`gaussian_weights` with mean 1, none below a floor.
+
+    Args:
+        opacities: Opacities.
+        areas: Mean projected areas, any unit, possibly as seen from the middle of the scene.
+        area_power: The weight is the opacity times the area to this power; 0 as in CVT-GS.
+        floor: No weight is below this share of the mean weight.
+
+    Returns:
+        Weights in float64 with mean 1 (before the floor); 1 everywhere if all would be 0, or one is
+        NaN.
 
     Raises:
         InvalidArgumentError: The floor or the power is below 0, or shapes do not fit.

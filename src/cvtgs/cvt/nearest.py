@@ -41,6 +41,10 @@ def nearest_site(
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
     """Find the nearest site of every point, on CUDA if they are there, else on the host.
 
+    Args:
+        points: Positions on any device.
+        sites: Positions on the same device, at least one.
+
     Returns:
         Labels and squared distances in float64. Ties may be resolved in any way.
 
@@ -62,10 +66,20 @@ def nearest_scipy(
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
     """Find the nearest site of every point with a k-d tree (Maneewongvatana and Mount 1999).
 
-    Points along a space-filling curve take half the time of shuffled ones. The tree is on the
-    host: positions from another device are copied there, and the result back. Memory: ``16 n``
-    bytes for the result, and a chunk of points in float64. Results and errors are those of
-    :func:`nearest_site`.
+    Distances are computed in float64. Points along a space-filling curve take half the time of
+    shuffled ones. The tree is on the host: positions from another device are copied there, and
+    the result back. Memory: ``16 n`` bytes for the result, and a chunk of points in float64.
+
+    Args:
+        points: Positions on any device.
+        sites: Positions, at least one.
+
+    Returns:
+        Labels and squared distances in float64. Ties may be resolved in any way.
+
+    Raises:
+        InvalidArgumentError: There is no site, shapes do not fit together, or (on the host) a
+            coordinate is not finite.
 
     Example:
         >>> labels, squared = nearest_scipy(torch.tensor([[0.9]]), torch.tensor([[0.0], [1.0]]))
@@ -106,6 +120,10 @@ def build_tree(sites: Float[Tensor, "m d"]) -> Any:
 @checked
 def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m k"]:
     """Find the nearest other sites of every site, on CUDA if they are there, else on the host.
+
+    Args:
+        sites: Positions on any device.
+        count: Number of neighbours per site; fewer if there are fewer other sites.
 
     Returns:
         Row numbers, k = min(count, m - 1); the site itself is not among them. Ties may be

@@ -115,9 +115,16 @@ def tessellate(
 def choose_seeds(
     weights: Float[Tensor, "n"], count: int, *, config: TessellationConfig, seed: int
 ) -> Int[Tensor, "m"]:
-    """Choose the rows of the points at which the sites start, as ``config.seeding`` says.
+    """Choose the points at which the sites start.
 
-    Weights are in the order of a Morton curve; the seed is that of random numbers, if any occur.
+    Args:
+        weights: Weights of the points, in the order of a Morton curve.
+        count: Number of sites.
+        config: The settings; ``seeding`` is used.
+        seed: Seed of the random numbers, if ``seeding`` draws any.
+
+    Returns:
+        Rows of the points.
 
     Raises:
         InvalidArgumentError: ``count`` is outside 1 to n, or a weight is negative or not finite.
@@ -134,9 +141,12 @@ def stratified_seeds(
 ) -> tuple[Int[Tensor, "count"], Float[Tensor, "count"]]:
     """Take points at equal steps of accumulated weight: systematic sampling, no random numbers.
 
-    Weights, at least 0, are those of points along a space-filling curve. Points that weigh at least
-    one step are always taken, and the step is recomputed for the others (Madow 1949), so every
-    point is taken at most once.
+    Points that weigh at least one step are always taken, and the step is recomputed for the
+    others (Madow 1949), so every point is taken at most once.
+
+    Args:
+        weights: Weights of points along a space-filling curve, at least 0.
+        count: Number of points to take, at most n.
 
     Returns:
         Row numbers, ascending, and the weight that each taken point represents; these weights
@@ -186,10 +196,14 @@ def stratified_seeds(
 def weighted_seeds(
     weights: Float[Tensor, "n"], count: int, generator: torch.Generator
 ) -> Int[Tensor, "count"]:
-    """Draw points at random without replacement, with probabilities by weight, at least 0.
+    """Draw points at random without replacement, with probabilities by weight.
 
-    The points with the smallest ``-log(u) / w`` are taken (Efraimidis and Spirakis 2006), those of
-    weight 0 last. The generator is on the CPU, so that every device draws the same.
+    The points with the smallest ``-log(u) / w`` are taken (Efraimidis and Spirakis 2006).
+
+    Args:
+        weights: Weights, at least 0; points of weight 0 are taken last.
+        count: Number of points to draw, at most n.
+        generator: Random generator on the CPU, so that every device draws the same.
 
     Returns:
         Row numbers, ascending.
@@ -252,9 +266,19 @@ def lloyd(
 ) -> LloydResult:
     """Move sites to the weighted centroids of their Voronoi cells (Lloyd 1982).
 
-    A site without points stays where it is, so the energy never rises. It stops when an iteration
-    lowers the energy by no more than the share ``tolerance``. ``on_iteration`` is called with the
-    number of finished iterations.
+    A site without points stays where it is, so the energy never rises.
+
+    Args:
+        points: Positions.
+        weights: Weights, at least 0.
+        sites: Initial sites.
+        nearest: Nearest-site search.
+        iterations: Largest number of iterations.
+        tolerance: Stop when an iteration lowers the energy by no more than this share.
+        on_iteration: Called with the number of finished iterations.
+
+    Returns:
+        The moved sites and the energies.
 
     Raises:
         InvalidArgumentError: Shapes do not fit together, ``iterations`` or ``tolerance`` is
@@ -315,6 +339,12 @@ def fill_empty_cells(
 
     Each cell keeps its cheapest point, so no cell becomes empty. A point in a cell of its own
     costs nothing, so the energy never rises.
+
+    Args:
+        labels: Cell of every point.
+        weights: Weights of the points.
+        squared: Squared distance of every point to its site.
+        count: Number of cells, at most n.
 
     Returns:
         New labels, new squared distances, and the number of cells that were empty.

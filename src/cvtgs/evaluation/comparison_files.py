@@ -70,6 +70,9 @@ def write_comparison(
         viewer: File name of a page with the scenes in 3D to link to, in the folder; or empty.
         listener: Called before the first file and after each.
 
+    Returns:
+        The paths of the files.
+
     Raises:
         OutputExistsError: A file exists and may not be replaced.
         OutputError: A file cannot be written.

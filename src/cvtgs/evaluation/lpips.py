@@ -214,6 +214,9 @@ def load_lpips(
         network: ``"vgg"`` or ``"alex"``.
         path: A weights file or a folder of weights files.
 
+    Returns:
+        The weights.
+
     Raises:
         InvalidArgumentError: There is no such network.
         MissingDependencyError: No path was given, and the package is missing or incomplete.

@@ -51,8 +51,15 @@ _QUAT_BITS = (10, 10, 10)  # of the smaller components; the top two bits index t
 def read_compressed_ply(path: Path) -> GaussianScene:
     """Read a compressed PLY file, as PlayCanvas' tools write it.
 
+    Args:
+        path: The file.
+
+    Returns:
+        The scene, with the comments of the file.
+
     Raises:
-        InputError: The file does not exist, or cannot be opened or read.
+        InputNotFoundError: The file does not exist.
+        InputError: It cannot be opened or read.
         FileFormatError: It is not a compressed PLY file, or damaged.
     """
     with open_input(path) as file:

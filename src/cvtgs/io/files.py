@@ -86,6 +86,9 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
     Args:
         path: A folder, or a file, which is returned as it is.
 
+    Returns:
+        The file.
+
     Raises:
         InputError: The folder has none of these, or cannot be read.
         InvalidArgumentError: It is no path.

@@ -57,6 +57,9 @@ def correct_cells(  # noqa: PLR0913 (options by name)
         sizes: Number of members of every cell in ``merged``; None if all are in the partition.
         on_cells: Called with the number of finished cells.
 
+    Returns:
+        The scene with corrected Gaussians.
+
     Raises:
         InvalidArgumentError: The network has another dtype than the scene, or needs a visibility
             of every Gaussian.

@@ -106,6 +106,9 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
     Args:
         source: ``standard`` or ``paper``, which come with the package, or the path of a file.
 
+    Returns:
+        The checkpoint.
+
     Raises:
         CheckpointError: There is no such file, or it is not a checkpoint, is damaged, or has a
             later format or another architecture.
@@ -136,9 +139,16 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
 
 
 def encode_checkpoint(net: Net, info: CheckpointInfo) -> bytes:
-    """Return the bytes of a safetensors file; the same network and description give the same.
+    """Return the bytes of a checkpoint file.
 
-    :func:`cvtgs.io.atomic_output` writes them.
+    The same network and description give the same bytes.
+
+    Args:
+        net: The network.
+        info: Its description.
+
+    Returns:
+        The bytes of a safetensors file, to be written with :func:`cvtgs.io.atomic_output`.
 
     Example:
         >>> info = CheckpointInfo(architecture=Architecture(), preset="standard")

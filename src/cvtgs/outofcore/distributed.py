@@ -38,10 +38,13 @@ _SHARE_SECONDS = 10.0  # seconds that a shared disk may take to show a new file 
 
 
 def connect(address: str) -> "Client":
-    """Connect to a scheduler; the caller must close the client.
+    """Connect to a scheduler.
 
     Args:
         address: Its address, such as ``tcp://10.0.0.1:8786``.
+
+    Returns:
+        A client, which the caller must close.
 
     Raises:
         MissingDependencyError: ``distributed`` is not installed.

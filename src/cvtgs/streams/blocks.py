@@ -165,9 +165,11 @@ def stream_file(  # noqa: PLR0913 (options by name)
 ) -> StreamReport:
     """Write a file that need not fit into memory as a stream of levels.
 
-    The file is sorted into blocks of space, as by :func:`cvtgs.outofcore.simplify_file`. Each is
-    simplified to its exact share of every level, which follows the cells of a sample of the scene,
-    and written as a part of the stream. After an interruption, the same call continues.
+    The file is sorted into blocks of space, which are stored in a hidden folder beside the output.
+    Each block is simplified to its exact share of every level, based on the analysis of the whole
+    scene, and written as a part of the stream. Shares follow the cells of a sample of the whole
+    scene. After an interruption, the same call continues with the unfinished blocks. The result
+    depends on the number of blocks, not on the workers.
 
     Args:
         source: A binary PLY file.
@@ -177,20 +179,26 @@ def stream_file(  # noqa: PLR0913 (options by name)
         memory: Bytes that one process may use; None for all free memory.
         blocks: Number of blocks, instead of ``memory``.
         chunk_gaussians: Maximum number of Gaussians of the finest level in a chunk.
-        environment_radii: As for :func:`plan_stream`; only a streamed SOG has an environment.
+        environment_radii: Gaussians farther from the centre than this, in robust radii, are the
+            environment of a streamed SOG, which all levels share; None for no environment.
         transform: Root transform of 3D Tiles (:func:`cvtgs.streams.geo_transform`).
         axes: Axes of the input file and of the output; those of 3D Tiles are fixed, so their
             output must be ``rdf``.
-        sh_degree: SH bands above this degree are dropped; None keeps all.
+        sh_degree: Highest SH degree to keep; None keeps all.
         simplifier: Configuration and network; None for the defaults.
-        workers: Call functions for blocks; None calls them in this process.
+        workers: Call functions for ranges of the file and for blocks; None calls them one after
+            the other in this process.
         overwrite: Whether files of an earlier stream may be replaced.
         listener: Called with progress events.
 
+    Returns:
+        The report.
+
     Raises:
         ConfigError: The configuration renders images, which needs the whole scene in memory.
-        InvalidArgumentError: Two ratios give the same size, the kind does not have an option, or
-            an argument is out of range or of another type.
+        InvalidArgumentError: A ratio is out of range, two ratios give the same size, chunks would
+            be empty, the kind does not have an option, or an argument is out of range or of another
+            type.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
         OutputExistsError: The folder holds files that may not be replaced.

@@ -42,7 +42,13 @@ _OWN_NAME = re.compile(r'"(\d+_\d+\.glb|\d+_\d+_\d+(?=/meta\.json")|environment(
 
 
 class StreamLevel(NamedTuple):
-    """Numbers of Gaussians, of files (or of folders of them) and of bytes of a written level."""
+    """Counts of a written level.
+
+    Attributes:
+        gaussians: Number of Gaussians.
+        files: Number of files, or of folders of files.
+        bytes: Total bytes of the files.
+    """
 
     gaussians: int
     files: int

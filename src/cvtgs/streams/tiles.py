@@ -190,6 +190,9 @@ def geo_transform(longitude: float, latitude: float, height: float = 0.0) -> tup
     Returns:
         16 numbers, column by column.
 
+    Raises:
+        InvalidArgumentError: A coordinate is out of range or not finite.
+
     Example:
         >>> [round(number) for number in geo_transform(0.0, 0.0)[12:]]
         [6378137, 0, 0, 1]

@@ -173,8 +173,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         presets: Names of presets; None for all, from the fastest to the best.
         rhos: Ratios of Gaussians to keep, each in (0, 1].
         cameras: Returns the views of the scene.
-        photographs: Returns the photographs of the views, at their size, to score all scenes
-            against too; None for none.
+        photographs: Returns their photographs, to score all scenes against too; None for none.
         settings: Background, LPIPS network and backend.
         device: Any torch device, or ``auto``.
         folder: Folder to keep the results in, made if it is missing, as ``fast_0.01.ply``; files
@@ -182,6 +181,9 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         trust_sizes: Whether to believe a compressed source that claims far more Gaussians than its
             bytes can hold.
         listener: Called after each run and image.
+
+    Returns:
+        Costs, scores and images.
 
     Raises:
         CvtgsError: The scene cannot be read, a preset or ratio is invalid, or a result would

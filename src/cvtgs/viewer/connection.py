@@ -26,7 +26,11 @@ _OWN_NAMES = {"localhost", "127.0.0.1", "::1"}
 
 
 def check_viewer() -> None:
-    """Raise MissingDependencyError if viser is not installed, before scenes are read."""
+    """Check that pages can be served, before scenes are read.
+
+    Raises:
+        MissingDependencyError: viser is not installed.
+    """
     try:
         import viser  # noqa: F401, PLC0415 (optional)
     except ImportError as error:

@@ -27,7 +27,12 @@ SCORE_SIDE, LEAST_SIDE = 480, 16  # longer side of scored images, and least of t
 
 
 class ShownScene(NamedTuple):
-    """A scene on the page, and a description of one line."""
+    """A scene on the page, and a description.
+
+    Attributes:
+        scene: The scene.
+        facts: The description, one line of text.
+    """
 
     scene: GaussianScene
     facts: str
@@ -70,9 +75,18 @@ class SceneViewer:
             self.scenes[name] = ShownScene(other, _counted(other, scene))
 
     def simplify(self, preset: str, rho: float) -> ShownScene:
-        """Simplify the scene to a ratio in (0, 1], and add the result to the scenes.
+        """Simplify the scene, and add the result to the scenes.
+
+        Args:
+            preset: Name of a preset.
+            rho: Ratio of Gaussians to keep, in (0, 1].
+
+        Returns:
+            The simplified scene.
 
         Raises:
+            InvalidArgumentError: The ratio is out of range.
+            ConfigError: The preset does not exist.
             RunError: The viewer was stopped.
         """
         if preset not in self._prepared:
@@ -97,12 +111,23 @@ class SceneViewer:
             raise RunError(f"the viewer was stopped during {event.stage}.")
 
     def warm_up(self, preset: str) -> None:
-        """Compute the data that all sizes share, if the scene was simplified with the preset."""
+        """Compute the data that all sizes share, so that the first slider move is not slower.
+
+        Args:
+            preset: Name of a preset; no-op unless the scene was simplified with it.
+        """
         if preset in self._prepared:
             self._prepared[preset].warm_up(WARM_RATIO)
 
     def score(self, name: str, cameras: Cameras) -> float:
-        """Return the mean PSNR of a scene against the full one, in dB; infinite for that itself.
+        """Return the mean PSNR of a scene against the full scene, in dB.
+
+        Args:
+            name: Name of the scene.
+            cameras: Cameras to render from.
+
+        Returns:
+            The mean over the cameras; infinite for the full scene itself.
 
         Raises:
             InvalidArgumentError: There is no such scene, or not yet, or no camera sees anything of
@@ -114,10 +139,17 @@ class SceneViewer:
         return float(psnr(small.rgb.clamp(0, 1), full.rgb.clamp(0, 1)).mean())
 
     def save(self, name: str, path: str | os.PathLike[str]) -> str:
-        """Write a scene to a new file; return a line with its path and number of Gaussians.
+        """Write a scene to a new file.
+
+        Args:
+            name: Name of the scene.
+            path: The file; its suffix sets the format.
+
+        Returns:
+            A line with the path and the number of Gaussians.
 
         Raises:
-            CvtgsError: The path is empty, there is no such scene, or :func:`cvtgs.save` fails.
+            CvtgsError: The name is empty, there is no such scene, or :func:`cvtgs.save` fails.
         """
         if not os.fspath(path).strip():
             raise OutputError("a file name is needed to save a scene, found none.")

@@ -68,9 +68,15 @@ _GIVE_UP = 0.5  # seconds between checks whether the server was closed
 
 
 def scene_page(scenes: Mapping[str, GaussianScene]) -> str:
-    """Return a standalone page, HTML that fetches nothing, whose time line flips between scenes.
+    """Return a standalone page with a 3D viewer, whose time line flips between scenes.
 
-    Colours are those of the constant SH band; the camera starts at a good view of the first scene.
+    Colours are those of the constant SH band.
+
+    Args:
+        scenes: The scenes by name; the camera starts at a good view of the first.
+
+    Returns:
+        HTML that needs no server and fetches nothing.
 
     Raises:
         MissingDependencyError: viser is not installed.
@@ -238,7 +244,11 @@ class ViewerServer:
             pass
 
     def finish(self) -> None:
-        """Wait until the first simplified scene is shown; raise if it cannot be computed."""
+        """Wait until the first simplified scene is shown.
+
+        Raises:
+            CvtgsError: It cannot be computed.
+        """
         self._first.wait()
         if self._error is not None:
             raise self._error

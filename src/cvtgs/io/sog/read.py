@@ -153,8 +153,12 @@ def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
         path: The ``.sog`` file, or the ``meta.json`` that lies beside its images.
         trust_sizes: Whether the images may unpack to any size.
 
+    Returns:
+        The scene.
+
     Raises:
-        InputError: A file is missing, or cannot be opened or read.
+        InputNotFoundError: The file does not exist, or an image is missing.
+        InputError: A file cannot be opened or read.
         FileFormatError: It is not a SOG, or damaged.
     """
     is_index = path.suffix.lower() == ".json"

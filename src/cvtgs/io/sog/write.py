@@ -72,6 +72,9 @@ def encode_sog(scene: GaussianScene) -> EncodedSog:
     Args:
         scene: The scene, on any device; a SOG must be able to hold all its rows.
 
+    Returns:
+        The encoded files.
+
     Raises:
         InvalidSceneError: A Gaussian of the scene is not finite.
     """
