@@ -43,8 +43,7 @@ def l1_loss(
         >>> l1_loss(torch.zeros(1, 2, 2, 3), torch.full((1, 2, 2, 3), 0.25)).item()
         0.25
     """
-    check_pair(prediction, target)
-    return _l1(*_widened(prediction, target)).mean()
+    return _l1(*_checked(prediction, target)).mean()
 
 
 def _l1(prediction: Tensor, target: Tensor) -> Float[Tensor, "c"]:
@@ -86,8 +85,7 @@ def mean_ssim(
     the image count, so the mean is over ``(h - 10) * (w - 10)`` positions. Memory: about 23 copies
     of one stack of images, 32 with the gradient.
     """
-    check_pair(prediction, target, least=SSIM_WINDOW)
-    prediction, target = _widened(prediction, target)
+    prediction, target = _checked(prediction, target, least=SSIM_WINDOW)
     center = target.detach().mean(dim=(1, 2), keepdim=True)
     return _ssim(prediction - center, target - center, center=center.permute(0, 3, 1, 2))
 
@@ -96,10 +94,9 @@ def mean_ssim(
 def _ssim(
     prediction: Tensor, target: Tensor, *, center: Tensor | float = 0.0
 ) -> Float[Tensor, "c"]:
-    """Return the SSIM of images from which a colour, ``center``, may have been subtracted.
+    """Return the SSIM of images, from which a colour, ``center``, may have been subtracted.
 
-    Variances are differences of squares: of bright, even images they are mostly rounding errors
-    without a centre, up to 1e-3 of SSIM in float32.
+    Variances are differences of squares: without it, rounding changes bright images by up to 1e-3.
     """
     from kornia.filters import filter2d_separable  # noqa: PLC0415 (slow)
 
@@ -155,18 +152,14 @@ def gradient_loss(
         >>> gradient_loss(edge, torch.zeros(1, 2, 2, 3)).item()
         0.5
     """
-    check_pair(prediction, target)
-    return _gradient(*_widened(prediction, target)).mean()
+    return _gradient(*_checked(prediction, target)).mean()
 
 
 def _gradient(prediction: Tensor, target: Tensor) -> Float[Tensor, "c"]:
-    difference = prediction - target
-    return _mean_step(difference, 2) + _mean_step(difference, 1)
-
-
-def _mean_step(difference: Float[Tensor, "c h w 3"], axis: int) -> Float[Tensor, "c"]:
-    steps = difference.diff(dim=axis).abs()
-    return steps.sum(dim=(1, 2, 3)) / max(steps[0].numel(), 1)
+    difference = prediction - target  # once: gradients of both axes are summed first
+    steps = [difference.diff(dim=axis).abs() for axis in (2, 1)]
+    dx, dy = (step.sum(dim=(1, 2, 3)) / max(step[0].numel(), 1) for step in steps)
+    return dx + dy
 
 
 def image_loss(
@@ -202,9 +195,8 @@ def image_loss(
     """
     if not 0 <= real_number(ssim_weight) <= 1:
         raise InvalidArgumentError(f"ssim_weight must be from 0 to 1, found {ssim_weight!r}.")
-    _check_weights(gradient_weight=gradient_weight)
-    check_pair(prediction, target, least=SSIM_WINDOW if ssim_weight else 1)
-    prediction, target = _widened(prediction, target)
+    check_not_negative(gradient_weight, "gradient_weight")
+    prediction, target = _checked(prediction, target, least=SSIM_WINDOW if ssim_weight else 1)
     dissimilarity = 1 - _ssim(prediction, target) if ssim_weight else 0.0
     return _image_loss(prediction, target, dissimilarity, ssim_weight, gradient_weight).mean()
 
@@ -243,10 +235,11 @@ def relative_loss(
         >>> round(relative_loss(grey, white, image_weight=0.0).item(), 3)
         -0.693
     """
-    _check_weights(mse_weight=mse_weight, image_weight=image_weight, ssim_weight=ssim_weight)
+    check_not_negative(mse_weight, "mse_weight")
+    check_not_negative(image_weight, "image_weight")
+    check_not_negative(ssim_weight, "ssim_weight")
     uses_ssim = bool(image_weight or ssim_weight)
-    check_pair(prediction, target, least=SSIM_WINDOW if uses_ssim else 1)
-    prediction, target = _widened(prediction, target)
+    prediction, target = _checked(prediction, target, least=SSIM_WINDOW if uses_ssim else 1)
     loss = prediction.new_zeros(len(prediction))
     if mse_weight:
         squared = (prediction - target).square().mean(dim=(1, 2, 3))
@@ -275,13 +268,9 @@ def _image_loss(
     return loss
 
 
-def _check_weights(**weights: float) -> None:
-    for name, weight in weights.items():
-        check_not_negative(weight, name)
-
-
-def _widened(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Return images of at least 32 bits per number, in which no sum overflows."""
+def _checked(prediction: Tensor, target: Tensor, *, least: int = 1) -> tuple[Tensor, Tensor]:
+    """Check images; return them with at least 32 bits per number, in which no sum overflows."""
+    check_pair(prediction, target, least=least)
     wide = torch.promote_types(prediction.dtype, torch.float32)
     return prediction.to(wide), target.to(wide)
 

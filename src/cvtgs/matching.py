@@ -62,10 +62,7 @@ class LinearView(NamedTuple):
 def linear_view(
     small: GaussianScene, camera: Cameras, wanted: Float[Tensor, "h w 3"]
 ) -> LinearView:
-    """Return the image of one camera as a linear function of the colours.
-
-    Colours below 0 are rendered as 0, so the function is exact only where no colour is below 0.
-    """
+    """Return an image as a linear function of colours, exact where none is below 0."""
     weights = blending_weights(small, camera)
     offsets = small.means.double() - camera.centers.to(small.device).double()
     directions = torch.nn.functional.normalize(offsets, dim=1).to(small.dtype)
@@ -156,10 +153,9 @@ def best_step(views: Sequence[LinearView], changes: Float[Tensor, "m k 3"]) -> f
 
 
 class LeastSquares:
-    """The normal equations of the colours with a ridge, and their solution.
+    """The normal equations of the colours with a ridge, for each of red, green and blue.
 
-    Conjugate gradients (Hestenes and Stiefel 1952) with the diagonal as preconditioner. Red, green
-    and blue are solved together: they share the matrix, but have their own step lengths.
+    Conjugate gradients (Hestenes and Stiefel 1952) with the diagonal as preconditioner.
     """
 
     def __init__(self, views: Sequence[LinearView], *, config: MatchConfig, frozen: int) -> None:

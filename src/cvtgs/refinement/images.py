@@ -56,10 +56,7 @@ def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> 
 def split_views(
     cameras: Cameras, *, config: RefineConfig, seed: int, full: GaussianScene | None = None
 ) -> RefineViews:
-    """Split given cameras, at least 2, into evenly spread held-out views and training views.
-
-    Held-out ones are among those that see the full scene, if it is given.
-    """
+    """Split cameras, at least 2; held-out ones are evenly spread among those that see ``full``."""
     seeing = range(len(cameras)) if full is None else seeing_rows(full, cameras)
     side = min(config.size, max(cameras.width, cameras.height))
     sized = cameras.fitted(side, least=SSIM_WINDOW * config.stride)
@@ -131,12 +128,7 @@ def _thinned(views: Sequence[Cameras], stride: int) -> tuple[Cameras, ...]:
 class ImageBuffer:
     """Training images: the first are new, later ones are new at intervals and reused in between.
 
-    A reused image is drawn at random from the least recently used half of the buffer. A step sees
-    every ``config.stride``-th pixel, with a random first one, and of these every ``thinning``-th,
-    as long as enough are left for SSIM.
-
-    Memory: 8 bytes per pixel of at most ``config.images`` images, or of one image if all are new,
-    and as much for the images of a step.
+    Memory: 8 bytes per pixel of ``config.images`` images, and as much for those of a step.
     """
 
     def __init__(

@@ -89,10 +89,7 @@ class Limits:
         self.steps += kind == "step"
 
     def reached(self) -> str:
-        """Return the limit that is reached: ``steps``, ``time``, or an empty string.
-
-        ``time`` means that one more step and check, as slow as the slowest so far, would not fit.
-        """
+        """Return the limit, ``steps`` or ``time``, that one more step would exceed; else ""."""
         if self._steps is not None and self.steps >= self._steps:
             return "steps"
         if self.seconds is None:
@@ -192,22 +189,16 @@ def heldout_psnr(scene: GaussianScene, scorer: Scorer) -> Float[Tensor, "p"]:
 
 
 def psnr_cap(first: Float[Tensor, "p"]) -> float:
-    """Return the PSNR at which images are capped: 10 dB above the median.
-
-    Otherwise a single view of a uniform wall, at 50 dB, would outweigh all others.
-    """
+    """Return the most that an image counts, dB, lest a view of a uniform wall outweigh others."""
     return min(MOST_PSNR, float(first.median()) + 10.0)
 
 
 class SceneOptimizer:
-    """A scene as initial values plus changes, and the optimizer of the changes.
+    """A scene as initial values plus changes, and Adam (Kingma and Ba 2015) for the changes.
 
-    A step of Adam (Kingma and Ba 2015) moves only the Gaussians that an image shows: all others
-    have no gradient, keep their momentum, and stay unchanged. Each has its own count of steps in
-    the correction of bias, without which those that are rarely shown would move up to four times
-    as far in a step. Its epsilon is a share of the root mean square of all gradients, so that what
-    images hardly show moves little. ``torch.optim.SparseAdam`` has neither, and any torch optimizer
-    first imports the torch compiler, which takes a second. Memory: five times the scene.
+    Unseen Gaussians keep their momentum. Each corrects bias by its own count of steps, or rarely
+    seen ones would move too far; epsilon is a share of the root mean square of all gradients.
+    ``torch.optim.SparseAdam`` has neither, and takes a second to import. Memory: five scenes.
     """
 
     def __init__(
@@ -283,12 +274,10 @@ class SceneOptimizer:
 
 
 def _units(scene: GaussianScene, scale: Float[Tensor, "n"]) -> dict[str, Tensor]:
-    """Return the length of one unit of change.
+    """Return the length of one unit of change, in the frame of each Gaussian.
 
-    Positions and rotations change in the frame of each Gaussian. As in the Fisher metric, a unit
-    changes its density equally along each axis: it is the standard deviation for a position, and
-    ``ab / |a^2 - b^2|``, at most 1, for a rotation of two axes. A needle moves as far along its
-    axis as a ball, and much less across it.
+    As in the Fisher metric, it changes the density equally along each axis: the standard deviation
+    for a position, ``ab / |a^2 - b^2|``, at most 1, for a rotation of two axes.
     """
     axes = torch.where((scale > 0)[:, None], torch.exp(scene.log_scales), 0.0)
     axes = axes.clamp_max(_LARGEST)  # their products must not overflow
@@ -318,13 +307,10 @@ def _like(values: Float[Tensor, "n"], tensor: Tensor) -> Tensor:
 
 @torch.no_grad()
 def learning_rate_scales(small: GaussianScene, full: GaussianScene) -> Float[Tensor, "n"]:
-    """Return the learning-rate factor of each Gaussian, 0 to 1.
+    """Return the learning-rate factor of each Gaussian, 0 to 1; invalid rows do not move.
 
-    Enclosed Gaussians (:func:`cvtgs.analysis.ambient_visibility`) move less, because they may be
-    all that other views see. So do Gaussians that represent few others: they are nearly right in
-    every view, and long steps towards a few images would lose more in all others. So do those that
-    are large for the scene, mostly fog: a change of one fills the images of cameras within it, and
-    other cameras hardly show it. Invalid rows do not move.
+    Less for enclosed ones (:func:`cvtgs.analysis.ambient_visibility`), all that other views may
+    see; for those of few others, which are nearly right; and for large ones, which are fog.
     """
     valid = valid_rows(small)
     some = small.select(valid)
@@ -348,9 +334,8 @@ def _size_factors(scene: GaussianScene, movable: Bool[Tensor, "n"]) -> Float[Ten
 def _concentrations(small: GaussianScene, full: GaussianScene) -> Float[Tensor, "n"]:
     """Return how few Gaussians of the full scene each represents: 0 for many, 1 for only itself.
 
-    With the shares of the mass nearest to it, this is the sum of their squares (the index of
-    Simpson 1949, one over their effective number), at most :data:`MOST_CONCENTRATED`, or the own
-    share of a Gaussian unchanged from the full scene, if that is larger.
+    The squared shares of the mass nearest to it, summed (the index of Simpson 1949), at most
+    :data:`MOST_CONCENTRATED`, or the own share of an unchanged Gaussian, if that is larger.
     """
     labels = _nearest_or_equal(full, small)
     same = torch.ones_like(labels, dtype=torch.bool)

@@ -128,10 +128,7 @@ def _backend(name: str, device: torch.device) -> Backend:
 
 
 def differentiable_once(scene: GaussianScene) -> GaussianScene:
-    """Return the scene, with gradients that raise where they are differentiated in turn.
-
-    Backends compute gradients without a graph: second derivatives would be 0, or lack a part.
-    """
+    """Return the scene; second derivatives, which backends lack, raise instead of being 0."""
     if not torch.is_grad_enabled():
         return scene
     leaves = {name: tensor for name, tensor in scene.tensors().items() if tensor.requires_grad}
@@ -231,10 +228,7 @@ def observe_in_two_passes(
 
 
 class PixelWeights:
-    """The blending weights of one image; see :class:`cvtgs.rendering.BlendingWeights`.
-
-    Memory: 24 bytes per pair of splat and reached pixel, and about as much again for a product.
-    """
+    """The weights of one image; 24 bytes per pair of splat and pixel, twice that in products."""
 
     def __init__(
         self,

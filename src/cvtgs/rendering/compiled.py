@@ -84,28 +84,19 @@ def takes_several_loops() -> bool:
 def for_each_camera(
     function: Callable[[Item], Result], cameras: Sequence[Item]
 ) -> Generator[Result, None, None]:
-    """Call a function for several cameras at a time, if their loops can share the threads.
-
-    Parts of an image, such as sorting, are computed by one thread. Where numba takes one loop at a
-    time, each loop gets all threads instead.
-    """
+    """Call a function for several cameras at a time, if their loops can share the threads."""
     at_a_time = len(cameras) > 1 and takes_several_loops()
     yield from in_threads(function, cameras, HOST) if at_a_time else map(function, cameras)
 
 
 @contextmanager
 def threads_of_torch() -> Iterator[None]:
-    """Make compiled functions called from this thread use as many threads as torch.
-
-    Images do not depend on the number, so they use more where torch is limited to one. Where both
-    share an OpenMP library, numba also changes the number for torch when it starts its threads, so
-    this restores it.
-    """
+    """Let compiled functions use as many threads as torch, or more where it is limited to one."""
     count, wanted = torch.get_num_threads(), kernel_threads()
     most = vars(numba.config)["NUMBA_NUM_THREADS"]
     before = numba.get_num_threads()
     numba.set_num_threads(max(1, min(wanted, most)))
-    if torch.get_num_threads() != count:
+    if torch.get_num_threads() != count:  # numba starts threads of an OpenMP library of both
         torch.set_num_threads(count)
     try:
         yield

@@ -42,11 +42,7 @@ Pixels with alpha near the cut-off of 1/255 may differ; a shift by half a pixel 
 
 
 def require(device: torch.device) -> None:
-    """Check that this backend works on a device by rendering a Gaussian and comparing with torch.
-
-    gsplat can be imported without CUDA and without a compiler, and fails only on use. Its first
-    use may also compile its kernels, which takes minutes. The outcome is cached.
-    """
+    """Render a Gaussian and compare with torch, once: only use shows whether gsplat works."""
     if device.type != "cuda":
         raise DeviceError(
             f"backend 'gsplat' works on CUDA only, found a scene on {device}; "
@@ -67,10 +63,9 @@ def rasterize(
     sh_degree: int,
     listener: ProgressListener = silent,
 ) -> RasterOutput:
-    """Render with gsplat, in float32, several cameras at once if they treat pixels alike.
+    """Render in float32, several cameras at once if they treat pixels alike.
 
-    Memory: that of gsplat for :data:`TOGETHER` Gaussians and :data:`PIXELS_TOGETHER` pixels, or
-    for one camera, and the images.
+    Memory: that of gsplat for :data:`TOGETHER` Gaussians and :data:`PIXELS_TOGETHER` pixels.
     """
     listener(ProgressEvent(stage=STAGE, done=0, total=len(cameras)))
     if len(scene) and len(cameras):
@@ -196,11 +191,9 @@ def _rasterize_all(
 
 
 def _about_cameras(scene: GaussianScene, cameras: Cameras) -> tuple[Tensor, Tensor, Tensor]:
-    """Return means and view matrices relative to the median camera position, and intrinsics.
+    """Return means and view matrices relative to the median camera, and intrinsics.
 
-    gsplat works in float32, which is too coarse for positions far from the origin; a mean would be
-    far from all cameras if one of them is far away. What concerns cameras alone is computed on the
-    host.
+    In float32, positions far from the origin are too coarse; a mean would follow a stray camera.
     """
     viewmats, intrinsics = to_matrices(cameras)
     rotations, count = viewmats[:, :3, :3], len(cameras)
@@ -215,10 +208,7 @@ def _about_cameras(scene: GaussianScene, cameras: Cameras) -> tuple[Tensor, Tens
 
 @cache
 def _failure(device: str) -> str:
-    """Return why gsplat does not render as the torch backend does, or "" if it does.
-
-    Enables gradients, since the caller may have disabled them.
-    """
+    """Return why gsplat does not render as the torch backend does, or "" if it does."""
     with torch.inference_mode(mode=False), torch.enable_grad():
         image, gradient = _probe(torch_backend.rasterize, "cpu")
         try:
@@ -239,11 +229,7 @@ def _failure(device: str) -> str:
 
 
 def _probe(rasterize_one: Callable[..., RasterOutput], device: str) -> tuple[Tensor, Tensor]:
-    """Return an image of one Gaussian and a gradient with respect to its mean, on the CPU.
-
-    Nothing in the scene is symmetric, so shifted pixels, swapped axes and a different order of SH
-    coefficients or quaternion components all show up.
-    """
+    """Return an image of an asymmetric Gaussian, and a gradient by its mean, on the CPU."""
     number = partial(torch.tensor, dtype=torch.float32, device="cpu")
     scene = GaussianScene(
         means=number([[0.05, -0.02, 1.0]]),

@@ -28,10 +28,7 @@ def copy_splats(packed: Array, lists: Ints, first: int, end: int, batch: Array) 
 
 @serial
 def reached_columns(splat: Array, room: float, box: PixelBox) -> int:
-    """Return a bit for every column of a tile that a splat reaches.
-
-    ``room`` is how far the exponent may fall below that of the peak, at most 0.
-    """
+    """Return a bit for every column where the exponent is at most ``-room`` below the peak."""
     square = room / splat[2] + room * splat[3] * splat[3] / splat[4]
     half = 1.00001 * math.sqrt(square) if square < WIDEST**2 else WIDEST  # also if it is NaN
     first, end = span(splat[0] - half, splat[0] + half, box[0], box[1])
@@ -49,11 +46,9 @@ def composite_all(
     open_rows: Ints,
     weights: Array,
 ) -> None:
-    """Add red, green, blue and depth to each pixel of ``image``; lower its transmittance.
+    """Blend splats into ``image``: red, green, blue, depth, and the transmittance left.
 
-    ``open_rows`` has a bit for each pixel of each tile that is 0 where finished. If ``weights`` is
-    not empty, also write the sum of ``alpha * T`` over the pixels of every intersection of a splat
-    and a tile, in splat order.
+    Unless ``weights`` is empty, write the sum of ``alpha * T`` of every intersection, in order.
     """
     starts, lists, side = tiles
     height, width = image.shape[:2]
@@ -93,10 +88,7 @@ def blend(
     centers: Array,
     state: tuple[Array, Ints],
 ) -> tuple[int, float]:
-    """Blend one splat into a tile; return the number of pixels finished, and its summed weight.
-
-    ``state`` holds the layers of the tile's pixels, and a bit for each that is 0 where finished.
-    """
+    """Blend a splat into a tile; return the number of pixels finished, and its summed weight."""
     (layers, open_rows), finished, total = state, 0, 0.0
     x0, x1, y0, y1 = box
     one, least = centers.dtype.type(1), centers.dtype.type(MIN_TRANSMITTANCE)
@@ -158,9 +150,7 @@ def composite_all_gradient(
 ) -> None:
     """Write the gradient by the packed splat of every intersection, in splat order.
 
-    ``state`` holds for each pixel the transmittance in front of these splats (0 where finished) and
-    the gradient times all light from these splats and behind them, and ``open_rows`` as in
-    `composite_all`.
+    ``state``: transmittance in front (0 where finished), gradient times light behind, open rows.
     """
     starts, lists, side = tiles
     transmittance, behind, open_rows = state
@@ -215,9 +205,7 @@ def blend_gradient(
 ) -> int:
     """Write the gradient of one splat in a tile; return the number of pixels it finished.
 
-    ``state`` holds for each pixel the transmittance in front of this splat (0 where finished), the
-    gradient times all light from this splat and behind it, and a bit that is 0 where finished.
-    ``out`` must be 0 on entry.
+    ``state`` is that of `composite_all_gradient` in this tile; ``out`` must be 0 on entry.
     """
     finished = 0
     transmittance, behind, open_rows = state

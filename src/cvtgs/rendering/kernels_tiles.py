@@ -90,10 +90,7 @@ def write_tiles(
 def sort_by_tile(
     tile_ids: Ints, splat_starts: Ints, is_open: Bools, tile_starts: Ints, lists: Ints
 ) -> None:
-    """Write the lists of tiles by counting sort: index in splat order, and splat.
-
-    Tiles that are not open get empty lists.
-    """
+    """Write the lists of open tiles by counting sort: index in splat order, and splat."""
     for tile_id in tile_ids:
         if is_open[tile_id]:
             tile_starts[tile_id + 1] += 1

@@ -242,10 +242,7 @@ def sum_places(starts: Ints, rows: Ints, per_place: Array, out: Array) -> None:
 
 
 class TileWeights:
-    """The blending weights of one image; see :class:`cvtgs.rendering.BlendingWeights`.
-
-    Memory: 5 bytes per pair of splat and reached pixel, and 20 per intersection of splat and tile.
-    """
+    """The weights of one image: 5 bytes per splat and pixel reached, 20 per splat and tile."""
 
     def __init__(
         self, splats: SplatArrays, tiles: TileArrays, size: tuple[int, int], *, count: int

@@ -52,17 +52,10 @@ def rasterize(
     sh_degree: int,
     listener: ProgressListener = silent,
 ) -> RasterOutput:
-    """Render with compiled loops, on as many threads as torch uses, up to four images at a time.
-
-    For each dtype the first call compiles for about five seconds, and the first backward pass for
-    as long again. The code is cached on disk, from where a later process loads it in half a second.
-    Results do not depend on the number of threads. Idle OpenMP threads spin for a while after each
-    loop; the embedding page of the docs shows how to save that CPU time.
+    """Render with compiled loops, without gradients up to four images at a time.
 
     Memory per image: ``11 n`` numbers for n Gaussians, ``12 p`` bytes for p intersections of splats
-    and tiles, and the image. The backward pass needs ``10 p`` numbers at a time. Where a scene has
-    more than four million intersections, its splats are blended in parts, front to back; tiles that
-    are opaque by then are left out of later lists.
+    and tiles, at most four million at a time, and the image; backward, ``10 p`` numbers.
     """
     tensors = [tensor.contiguous() for tensor in scene.tensors().values()]
     pinholes = to_pinholes(cameras)
@@ -193,10 +186,7 @@ def _project(gaussians: GaussianArrays, settings: RasterSettings) -> SplatArrays
 
 
 def _parts(splats: SplatArrays, open_rows: NDArray[np.int64]) -> Iterator[SplatArrays]:
-    """Split splats, front to back, into parts of at most ``INTERSECTIONS`` or of one splat.
-
-    There are no more once all pixels are finished.
-    """
+    """Split splats, front to back, into parts of ``INTERSECTIONS`` while pixels are unfinished."""
     begin, count = 0, len(splats.rows)
     while begin < count and open_rows.any():
         limit = splats.starts[begin] + INTERSECTIONS

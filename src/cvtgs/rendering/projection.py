@@ -57,8 +57,7 @@ class Pinhole:
     def slopes(self) -> list[tuple[float, float]]:
         """Bounds to which x/z and y/z are clamped in the Jacobian of the projection.
 
-        With a centred principal point they are 1.3 times the tangent of half the field of view, as
-        in 3DGS; otherwise they move with the edges of the image, as in gsplat.
+        They are those of 3DGS for centred images, and move with the edges of others, as in gsplat.
         """
         return [
             (
@@ -70,10 +69,7 @@ class Pinhole:
 
 
 class CameraTensors(NamedTuple):
-    """A pinhole camera as tensors on the scene's device; the bounds are those of ``slopes``.
-
-    ``forward`` is the direction of depths; it and ``center`` are float64.
-    """
+    """A camera as tensors on the scene's device; ``center`` and ``forward`` are float64."""
 
     rotation: Float[Tensor, "3 3"]
     center: Float[Tensor, "3"]
@@ -94,10 +90,7 @@ class CameraTensors(NamedTuple):
 
 
 def to_matrices(cameras: Cameras) -> tuple[Float[Tensor, "c 4 4"], Float[Tensor, "c 3 3"]]:
-    """Check cameras; return view matrices without scales, and intrinsics, float64 on the host.
-
-    Without their uniform scales, depths are in scene units.
-    """
+    """Check cameras; return view matrices without uniform scales, and intrinsics, on the host."""
     both = cameras.viewmats.flatten(1).double(), cameras.Ks.flatten(1).double()
     table = torch.cat(both, dim=1).detach().cpu()
     viewmats, Ks = table[:, :16].view(-1, 4, 4), table[:, 16:].view(-1, 3, 3)  # noqa: N806 (as gsplat)
@@ -159,9 +152,7 @@ def _check(viewmats: NDArray[np.float64], Ks: NDArray[np.float64]) -> None:  # n
 class Splats:
     """Gaussians projected to one image, front to back.
 
-    With ``(u, v)`` the offset of a pixel from the centre, the squared Mahalanobis distance is
-    ``steep (u + shear v)^2 + flat v^2``. This is the conic of 3DGS, ``A u^2 + 2 B u v + C v^2``,
-    as ``L D L^T``: it is never negative and stays accurate for needles of any length.
+    The conic of 3DGS is ``steep (u + shear v)^2 + flat v^2``: exact for needles, never negative.
     """
 
     rows: Int[Tensor, "m"]  # row of the Gaussian in the scene
@@ -173,14 +164,11 @@ class Splats:
 
 
 def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
-    """Project a scene by EWA splatting (Zwicker et al. 2001) with the rules of 3DGS.
+    """Project the Gaussians in view by EWA splatting (Zwicker et al. 2001), as 3DGS does.
 
-    The covariance is ``M M^T + 0.3 I`` with ``M = J W R S``. Its determinant comes from the minors
-    of ``M`` (Cauchy-Binet), which avoids subtracting large numbers. Gaussians behind the near
-    plane, outside the image, too faint, or with non-finite values are left out.
-
-    Memory with gradients: about ``(150 + 6 k) n`` numbers for n Gaussians in view with k SH
-    coefficients beyond degree 0.
+    The covariance is ``M M^T + 0.3 I`` with ``M = J W R S``; its determinant comes from the minors
+    of ``M`` (Cauchy-Binet), which avoids subtracting large numbers. Memory: with gradients
+    ``(150 + 6 k) n`` numbers for n Gaussians in view with k view-dependent SH coefficients.
     """
     beside = CameraTensors.of(camera, scene.means)
     rows = _candidates(scene, camera, beside)
@@ -284,8 +272,7 @@ def _image_axes(
 def _ellipses(axes: Float[Tensor, "m 2 3"], dilation: float) -> tuple[Tensor, Tensor]:
     """Return the ellipses, and the share of its opacity that an antialiased Gaussian keeps.
 
-    For a covariance ``(a b; b d)``, steep is ``d / det``, shear ``-b / d`` and flat ``1 / d``.
-    Dividing one row of ``M`` by ``sqrt(d)`` first keeps the determinant within float32 range.
+    One row of ``M`` is divided by ``sqrt(d)`` first, so the determinant stays in float32 range.
     """
     across, down = axes.unbind(1)
     bare_a = (across * across).sum(dim=1)
@@ -334,10 +321,7 @@ def rows_are_finite(*parts: Float[Tensor, "m ..."]) -> Bool[Tensor, "m"]:
 
 
 def warn_of_near_plane(scene: GaussianScene, cameras: Sequence[Cameras], *, name: str) -> None:
-    """Warn if the near plane hides much of a scene, whose units are too large, from some cameras.
-
-    Each of the cameras is a single one.
-    """
+    """Warn if the near plane hides much of a scene from some single cameras."""
     points = scene.means[:: -(-len(scene) // SAMPLED)].double().cpu()
     shares = []
     for camera in cameras:

@@ -72,9 +72,7 @@ def rasterize(
     """Render with torch operations only.
 
     Memory: for p intersections of splats and tiles, ``60 p`` bytes while they are listed, and
-    about ``10 * CELLS`` numbers while a batch is composited.
-    With gradients each camera also keeps the tensors of its projection, ``30 p`` bytes and the
-    image; its backward pass needs ``10 p`` numbers at a time.
+    ``10 CELLS`` numbers; with gradients also the projection, ``30 p`` bytes and ``10 p`` numbers.
     """
     images = (_render_one(scene, sh_degree, camera) for camera in to_pinholes(cameras))
     return backends.collect_images(images, scene, cameras, listener=listener)
@@ -130,11 +128,7 @@ def _render_one(scene: GaussianScene, sh_degree: int, camera: Pinhole) -> Float[
 
 
 class _Composite(torch.autograd.Function):
-    """Compositing, with a backward pass that recomputes the same batches.
-
-    Nothing is kept per pixel and splat. Gradients are summed per intersection, then over the
-    intersections of each splat in a fixed order, so no race can change them.
-    """
+    """Compositing; the backward pass recomputes the batches, and sums in a fixed order."""
 
     @staticmethod
     def forward(ctx: Any, packed: Tensor, lists: TileLists) -> Tensor:
@@ -155,10 +149,7 @@ class _Composite(torch.autograd.Function):
 def intersect(splats: Splats, size: tuple[int, int], side: int) -> TileLists:
     """List, for each splat, the tiles with a pixel where its alpha reaches 1/255.
 
-    The test is exact up to rounding, which only ever adds tiles: each splat is cut into the rows
-    of tiles that it crosses, and the ellipse's extent within each row gives the tiles.
-
-    Memory: about 60 bytes per intersection and 100 per splat.
+    Exact up to rounding, which only adds tiles. Memory: 60 bytes per intersection, 100 per splat.
     """
     width, height = size
     across, down = -(-width // side), -(-height // side)
@@ -202,16 +193,12 @@ def _strips(
 
 
 def _extent(ellipses: Tensor, reach: Tensor, upper: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the left and right extent of ellipses between two heights, relative to the centre.
-
-    The right edge is a concave function of the height: its maximum is at the ellipse's rightmost
-    point, or at the end of the interval that is nearest to it.
-    """
+    """Return the left and right extent of ellipses between two heights, relative to the centre."""
     steep, shear, flat = ellipses.unbind(1)
     half_width = half_sizes(ellipses, reach)[0]
     tip = -shear / flat * reach / half_width.clamp_min(torch.finfo(reach.dtype).tiny)
 
-    def edge(at: Tensor, side: int) -> Tensor:
+    def edge(at: Tensor, side: int) -> Tensor:  # a concave function: farthest nearest to the tip
         height = torch.minimum(torch.maximum(at, upper), lower)
         inside = (reach - flat * height * height).clamp_min(0)
         return -shear * height + side * (inside / steep).sqrt()
@@ -250,10 +237,7 @@ class TileBatch:
 
 
 def composite(packed: Float[Tensor, "m 10"], lists: TileLists) -> Float[Tensor, "t q 5"]:
-    """Composite every tile.
-
-    Memory: the result, and about ten arrays of ``CELLS`` numbers.
-    """
+    """Composite every tile; memory: the result and about ten arrays of ``CELLS`` numbers."""
     result = packed.new_zeros(len(lists.starts) - 1, lists.side**2, 5)
     result[..., 4] = 1
     for batch in _batches(packed, lists):
@@ -271,9 +255,7 @@ def composite_gradient(
 ) -> Float[Tensor, "m 10"]:
     """Return the gradient of :func:`composite`, front to back over the same batches.
 
-    Running forward again gives bit-identical transmittances; the light from behind a splat is the
-    total minus that up to and including the splat. (3DGS runs back to front and divides.)
-
+    Light from behind a splat is the total minus that up to it; 3DGS divides, back to front.
     Memory: ten numbers per intersection, and about fifteen arrays of ``CELLS`` numbers.
     """
     behind = (result * grad).sum(dim=2)
@@ -362,10 +344,7 @@ def _composite_batch(
 def _scan(
     values: Float[Tensor, "b k q"], combine: Callable[[Tensor, Tensor], Tensor]
 ) -> Float[Tensor, "b k q"]:
-    """Compute an inclusive scan along axis 1 by doubling (Hillis and Steele 1986).
-
-    This is several times faster than ``cumprod`` along an axis other than the last.
-    """
+    """Scan along axis 1 by doubling (Hillis and Steele 1986), much faster than ``cumprod``."""
     reach = 1
     while reach < values.shape[1]:
         further = combine(values[:, reach:], values[:, :-reach])

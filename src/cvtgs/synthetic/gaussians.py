@@ -59,10 +59,7 @@ class Chunk:
         return median * torch.exp(spread * self.normals())
 
     def square_points(self) -> Float[Tensor, "n 2"]:
-        """Return evenly spread points of the unit square.
-
-        The R2 sequence (Roberts 2018), with each point jittered by a part of the spacing.
-        """
+        """Return evenly spread, jittered points of the unit square (R2 sequence, Roberts 2018)."""
         rows = torch.arange(self.start, self.stop, dtype=torch.float64)
         steps = torch.tensor([1 / _PLASTIC_NUMBER, 1 / _PLASTIC_NUMBER**2], dtype=torch.float64)
         jitter = (self.uniforms(2) - 0.5) * (_JITTER / math.sqrt(self.total))
@@ -197,10 +194,7 @@ def diffuse_light(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
 def specular_colors(
     normals: Float[Tensor, "n 3"], strength: float, chunk: Chunk
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n k 3"]]:
-    """Return the mean colour and the SH coefficients of reflections of sun and sky.
-
-    The coefficients have some noise, like trained ones.
-    """
+    """Return the mean colour and the noisy SH coefficients of reflections of sun and sky."""
     rest = (0.015 + 0.02 * strength) * chunk.normals(chunk.rest_count, 3)
     if strength == 0.0:
         return torch.zeros_like(normals), rest
@@ -221,10 +215,9 @@ def specular_colors(
 def highlights(
     directions: Float[Tensor, "n 3"], peaks: Float[Tensor, "n 3"], rest_count: int
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n k 3"]]:
-    """Project round highlights onto spherical harmonics.
+    """Project round highlights, of given colours at their peaks, onto spherical harmonics.
 
-    A lobe around direction ``d`` has coefficients ``w_l Y_lm(d)`` (Funk-Hecke theorem); the
-    weights ``w_l`` are scaled so that the highlight has the given colour at its peak.
+    A lobe around direction ``d`` has coefficients ``w_l Y_lm(d)`` (Funk-Hecke theorem).
     """
     degree = degree_of(rest_count)
     if degree == 0:
@@ -249,10 +242,7 @@ def _toward_sun() -> Float[Tensor, "3"]:
 def haze(
     center: Float[Tensor, "3"], extent: Float[Tensor, "3"], depth: float, color: Color
 ) -> Draw:
-    """Fill a soft ellipsoid with many faint Gaussians.
-
-    Their size depends on their number, so that the haze is equally dense at every count.
-    """
+    """Fill a soft ellipsoid with faint Gaussians, as dense at every count."""
     rgb = torch.tensor(color, dtype=torch.float32)
     shadow = 2 * math.pi * float(extent.prod()) ** (2 / 3)
 

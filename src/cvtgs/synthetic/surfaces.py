@@ -74,10 +74,7 @@ def placed(
 
 
 def quads(corners: Float[Tensor, "k 3"], sides: Float[Tensor, "k 2 3"]) -> Surface:
-    """Build parallelograms; their normals are ``sides[:, 1] x sides[:, 0]``.
-
-    Seen from outside, texture coordinates run right and down if the sides do.
-    """
+    """Build parallelograms seen from outside, whose sides run right and down."""
     crosses = torch.linalg.cross(sides[:, 1], sides[:, 0])
     areas = torch.linalg.vector_norm(crosses, dim=1)
     ends = areas.double().cumsum(0)

@@ -179,10 +179,7 @@ Item = TypeVar("Item", Case, ViewImages)
 
 
 class DeviceCopies:
-    """A cache of copies of cases and images on a device; the least recently used are evicted.
-
-    The copies take at most ``room`` bytes: by default half of the free memory on CUDA, else 1 GB.
-    """
+    """Copies on a device of cases and images, the least recently used of which are evicted."""
 
     def __init__(self, device: torch.device, room: int | None = None) -> None:
         self.device: torch.device = device
@@ -220,11 +217,7 @@ def _byte_count(value: Any) -> int:
 def render_targets(
     scene: GaussianScene, count: int, *, size: int, seed: int, file: Path | None = None
 ) -> ViewImages:
-    """Render a full scene from evenly spread cameras of a file, or from mixed views.
-
-    Mixed views include blurred ones, as in the training of the shipped networks. About every third
-    image ignores the tag ``SplatRenderMode: mip``, as many viewers do.
-    """
+    """Render a full scene, in both modes, from cameras of a file or mixed views, also blurred."""
     if file is None:
         cameras = mixed_views(scene, count, size=size, seed=seed, sharp=False)
     else:

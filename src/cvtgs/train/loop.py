@@ -222,11 +222,9 @@ class CaseGradient(NamedTuple):
 def step_gradients(
     cases: Sequence[CaseWithViews], config: TrainConfig, cache: Path, copies: DeviceCopies
 ) -> Iterator[Callable[[Net, int], list[CaseGradient]]]:
-    """Give a function that computes the gradients of all cases of a step.
+    """Give a function for the gradients of all cases of a step, shared by processes on a CPU.
 
-    On a CPU, as many processes as there are cores share several cases; each reads the prepared
-    scenes from the cache. Case, ratio, view and crop depend only on the seed, the step and the
-    number of the case, so that the number of processes changes rounding only.
+    Draws depend only on seed, step and number of the case: processes change rounding only.
     """
     numbers = range(config.cases_per_step)
     has_processes = copies.device.type == "cpu" and can_start_processes()

@@ -37,11 +37,9 @@ TILE_WIDTH = 7.0  # in units of the largest standard deviation of its cell, befo
 def scene_loss(
     net: MergeNet, case: Case, views: ViewImages, *, config: TrainConfig, rng: random.Random
 ) -> Float[Tensor, ""]:
-    """Compare random crops of images of the corrected scene, over black or a random background.
+    """Compare random crops of images of the scene with its cells in these crops corrected.
 
-    Only cells that can be seen in these crops are corrected, which saves most of the time. Whole
-    images are rendered, because a camera of the crop alone would project Gaussians beside it
-    differently.
+    A camera of the crop alone would project Gaussians beside it differently: images are whole.
     """
     shots = [_Shot.draw(views, config.views.crop, case, rng) for _ in range(config.views.per_step)]
     case = case.select(_seen_cells(case, [shot.crop_camera() for shot in shots]))
@@ -88,10 +86,7 @@ class _Shot(NamedTuple):
 
 
 def _draw_view(views: ViewImages, case: Case, rng: random.Random) -> int:
-    """Draw an image; of a scene tagged ``SplatRenderMode: mip``, one that ignores it half the time.
-
-    Otherwise the network would serve viewers that honour the tag at the cost of the others.
-    """
+    """Draw an image; of a scene tagged mip, half the time one for viewers that ignore the tag."""
     numbers: Sequence[int] = range(len(views.cameras))
     modes = views.cameras.ignores_tag
     if case.reference.merged.antialiased and len(set(modes)) > 1:
@@ -141,11 +136,7 @@ def local_loss(
 def published_loss(
     net: PublishedMergeNet, case: Case, *, config: TrainConfig, rng: random.Random
 ) -> Float[Tensor, ""]:
-    """Compare crops of single cells, members against the corrected Gaussian, as CVT-GS does.
-
-    The loss is ``0.8 L1 + 0.2 (1 - SSIM) + 0.2 gradient`` per crop, with all SH bands. Each cell is
-    seen from a random direction, at a random zoom, over a random background.
-    """
+    """Compare crops of cells with the corrected Gaussian, as CVT-GS does, in all SH bands."""
     scene, merged, partition = case.reference[:3]
     rows = _draw_cells(partition.counts[case.cells], config, rng)
     cells = case.cells[rows]
@@ -195,10 +186,7 @@ def view_loss(
 
 @torch.no_grad()
 def validation_psnr(net: Net, case: Case, views: ViewImages) -> tuple[float, float]:
-    """Return the mean PSNR over grey without and with the network, in decibels.
-
-    A view counts at most ``MOST_PSNR``: an empty one has infinite PSNR, and no gain could be told.
-    """
+    """Return the mean PSNR over grey without and with the network, dB; at most MOST_PSNR each."""
     merged = case.reference.merged
     grey = merged.means.new_full((3,), 0.5)
     target = views.over(grey)
@@ -247,8 +235,7 @@ def lay_out_cells(
 ) -> CellGrid:
     """Put cells in the tiles of a grid, each rotated, zoomed and shifted at random.
 
-    Tiles are ``tile`` pixels wide; their centres are ``apart`` tile widths apart. Colours are those
-    of the constant band, or of all bands as seen by the camera.
+    Tiles are ``tile`` pixels wide; their centres are ``apart`` tile widths apart.
     """
     side = math.ceil(math.sqrt(len(cells)))
     merged = reference.merged.select(cells)

@@ -221,10 +221,7 @@ def cut_block(scene: GaussianScene, count: int, *, seed: int) -> GaussianScene:
 
 
 def perturb(scene: GaussianScene, rng: random.Random) -> GaussianScene:
-    """Thin, stretch and recolour a scene, and draw whether it is tagged ``SplatRenderMode: mip``.
-
-    Rotations, translations and uniform scales would add nothing: descriptors are invariant to them.
-    """
+    """Thin, stretch, recolour and perhaps tag a scene; descriptors are invariant to motions."""
     generator = torch.Generator().manual_seed(rng.getrandbits(62))
     share = rng.uniform(0.4, 1.0)
     draws = torch.rand(len(scene), generator=generator, dtype=torch.float32)
@@ -261,10 +258,9 @@ class TrainingScene:
 
 
 def prepare_scene(source: Source, config: TrainConfig, folder: Path) -> TrainingScene:
-    """Return the data of a scene, from the cache if possible.
+    """Return the data of a scene, memory-mapped, from the cache if possible.
 
     Images and cases are in separate files, so that trainings for other presets share images.
-    Memory: one scene during its preparation; cached tensors are memory-mapped.
     """
     simplify = SimplifyConfig.from_preset(config.preset)
     ratios = config.data.validation_ratios if source.is_validation else config.data.ratios

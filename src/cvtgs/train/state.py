@@ -279,10 +279,7 @@ class TrainState:
             ) from error
 
     def _check_settings(self, path: Path, theirs: dict[str, Any], config: TrainConfig) -> None:
-        """Raise an error for other settings, which names the first one that differs.
-
-        A finished training may go on with a restart at its end: until there, both are the same.
-        """
+        """Raise for other settings, but for a restart at the end of a finished training."""
         ours = _fingerprint(config, self.start)
         if set(theirs) != set(ours):
             raise CheckpointError(

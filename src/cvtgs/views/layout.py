@@ -159,10 +159,7 @@ def hidden_share(eye: Float[Tensor, "3"], points: Float[Tensor, "v 3"]) -> float
 def size_growths(
     sized: SizedPoints, eyes: Float[Tensor, "e 3"], radius: float, *, least_cells: int = 1
 ) -> list[float]:
-    """Return the correlation of sizes with distances from points, as a mean over directions.
-
-    It is 0 if fewer cells of directions than ``least_cells`` have enough Gaussians.
-    """
+    """Return mean correlations of sizes with distances from points, 0 for few filled cells."""
     offsets = sized.means - eyes[:, None]
     distances = torch.linalg.vector_norm(offsets, dim=2)
     near = (distances < _FARTHEST * radius) & (distances > 0)
@@ -244,10 +241,7 @@ class SceneLayout:
 
 
 def find_layout(scene: GaussianScene) -> SceneLayout:
-    """Return the layout of a scene, from robust statistics of its visible Gaussians.
-
-    Memory: a mask per attribute, and a sample of at most 30,000 Gaussians.
-    """
+    """Return the layout of a scene, from robust statistics of its visible Gaussians."""
     valid = viewable_part(scene)
     sample, _ = covering_sample(valid, SAMPLE_SIZE)
     positions = _visible_positions(valid)
@@ -326,9 +320,9 @@ def _far_directions(
 
 
 def covering_sample(scene: GaussianScene, count: int) -> tuple[GaussianScene, Float[Tensor, "k 1"]]:
-    """Return the heaviest Gaussians and every k-th other, enlarged to cover for omitted ones.
+    """Return the heaviest and every k-th other Gaussian, on the CPU, of SH degree 0.
 
-    The sample has SH degree 0 and is on the CPU; also return what was added to its log scales.
+    They are enlarged to cover for the omitted ones, by the second value in log scales.
     """
     plain = scene.with_tensors({"shN": scene.shN[:, :0]}, {})
     enlargement = torch.zeros(len(scene), 1, dtype=scene.dtype, device=scene.device)

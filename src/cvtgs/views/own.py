@@ -121,10 +121,7 @@ def _looking(cameras: Cameras, scene: GaussianScene) -> Bool[Tensor, "c"]:
 def in_images(
     cameras: Cameras, scene: GaussianScene
 ) -> tuple[Float[Tensor, "c"], Float[Tensor, "c"]]:
-    """Return the shares of the visible Gaussians in images, and of images that these span.
-
-    They span what lies between the first and the last tenth of their centres in width and height.
-    """
+    """Return the shares of visible Gaussians in images, and of images that the middle ones span."""
     rows = (scene.opacities > _VISIBLE).nonzero()[:, 0]
     rows = rows[:: max(1, -(-len(rows) // _MOST_POINTS))]
     points = scene.means[rows].double().cpu()

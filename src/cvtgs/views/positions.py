@@ -277,8 +277,7 @@ def _behind_walls(
 ) -> Bool[Tensor, "c"]:
     """Return which positions, in robust radii, are behind the walls of a room open to a side.
 
-    Images were taken inside or from this side, not over its walls from behind, so there may be
-    no wall between the middle and a position, nor the position lowered to the height of the middle.
+    Images were taken inside or from this side, so no wall may hide the middle, nor be at its level.
     """
     target, points = layout.frame.normalize(middle[None])[0], layout.voxels.points
     level = local - ((local - target) @ layout.up)[:, None] * layout.up
@@ -290,8 +289,7 @@ def _behind_walls(
 def _sharp_sides(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, "d"]:
     """Return which of the sides that some positions face are sharp; sides from below are not.
 
-    The back of an object may be all smooth: its Gaussians are larger than those of the front, so
-    sizes shrink with distance from behind, even though images were taken there.
+    The back of an object may be all smooth: sizes shrink with distance, though images were taken.
     """
     directions = _side_directions()
     sides, is_outside = _sides(layout, eyes)
@@ -350,9 +348,8 @@ def split_by_clutter(
 ) -> tuple[Float[Tensor, "c 3"], Float[Tensor, "k 3"]]:
     """Return positions with a clear view of the middle, and others that look through clutter.
 
-    A wall or a street is photographed from one side. From all others, large floaters hide it: even
-    the finest splats of an image are large. A few of them before an object are no clutter. These
-    are all positions and none; or, in a capture from one side, at most 64 together.
+    From behind, large floaters hide a wall or a street: even the finest splats of an image are
+    large. These are all positions and none; or, in a capture from one side, at most 64 together.
     """
     none = eyes[:0]
     if len(scene) < _FEW:

@@ -62,11 +62,7 @@ def image_device(layout: SceneLayout) -> torch.device:
 def score_cameras(
     layout: SceneLayout, cameras: Cameras, *, distances: Float[Tensor, "c"]
 ) -> tuple[Bool[Tensor, "c"], Float[Tensor, "c"]]:
-    """Return which cameras are good by small images, and penalties (0 is best) of all of them.
-
-    A camera is bad if it is inside a Gaussian, if something near fills too much of the image or
-    hides its middle, or if too little of the image is filled.
-    """
+    """Return which cameras are good by small images, and penalties (0 is best) of all of them."""
     small = cameras.fitted(PIXELS, least=8)
     images = render(layout.sample.to(image_device(layout)), small, depth=True)
     alpha = images.alpha.cpu()

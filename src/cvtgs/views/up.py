@@ -113,14 +113,11 @@ class Floor(NamedTuple):
 def find_up(
     voxels: Voxels, far: Float[Tensor, "k 3"], *, enclosed: bool = False
 ) -> Float[Tensor, "3"]:
-    """Return the up direction as a unit vector.
+    """Return the up direction, a unit vector: one of the axes, or normal to the largest plane.
 
-    The candidates are both directions of the axes and of the normal of the largest plane. Their
-    scores add up: how usual they are in captures (-y most, then +y and +z), a bare floor with
-    nothing beneath it, a large plane, and a sky, if distant content is on one side. If there is no
-    bare floor, the sizes of Gaussians count too: captures seldom see a scene from below, and
-    unseen parts have larger Gaussians. So does the skewness of heights: things stand on wide feet,
-    and few reach far up. Both say nothing of an ``enclosed`` scene, which is seen from its middle.
+    Scores add up: how usual it is, a bare floor, a large plane, a sky on one side; without a bare
+    floor also large Gaussians below, unseen by captures, and low heights, as things stand on wide
+    feet. These two say nothing of an ``enclosed`` scene, which is seen from its middle.
     """
     usual = voxels.points.new_tensor(_USUAL)
     if len(voxels.points) < 8:
