@@ -123,11 +123,11 @@ def test_a_run_interrupted_between_checkpoint_and_state_can_be_resumed(
     run(config, whole, cache)
     true = train_loop.TrainState.save
 
-    def breaking(state, path, config):
+    def breaking(state, path):
         calls.append(state.step)
         if len(calls) == 3:
             raise PowerCutError
-        true(state, path, config)
+        true(state, path)
 
     with monkeypatch.context() as patch:
         patch.setattr(train_loop.TrainState, "save", breaking)

@@ -47,13 +47,13 @@ def saved(path: Path) -> Path:
     state = stepped(TrainState(small_net(), CONFIG), 3)
     gains = (Gain("room", 0.1, 0.1 + 0.2), Gain("room", 0.01, -1e-9))
     state.history.validations.append(Validation(step=0, loss=math.nan, gains=gains))
-    state.save(path, CONFIG)
+    state.save(path)
     return path
 
 
 def loaded(path: Path, config: TrainConfig = CONFIG) -> TrainState:
     state = TrainState(small_net(seed=1), config)
-    state.load(path, config)
+    state.load(path)
     return state
 
 
@@ -78,7 +78,7 @@ def test_continuing_gives_the_same_bits(tmp_path):
 def test_saving_again_gives_the_same_bytes(tmp_path):
     path = saved(tmp_path / "a.state")
     state = loaded(path)
-    state.save(tmp_path / "b.state", CONFIG)
+    state.save(tmp_path / "b.state")
     assert (tmp_path / "b.state").read_bytes() == path.read_bytes()
 
 
@@ -91,7 +91,7 @@ def test_continuing_does_not_change_the_file(tmp_path):
 
 def test_a_state_before_the_first_step(tmp_path):
     path = tmp_path / "a.state"
-    TrainState(small_net(), CONFIG).save(path, CONFIG)
+    TrainState(small_net(), CONFIG).save(path)
     state = stepped(loaded(path), 2)
     wanted = stepped(TrainState(small_net(), CONFIG), 2)
     assert bits_of(state.net.state_dict()) == bits_of(wanted.net.state_dict())
@@ -147,7 +147,7 @@ def test_another_configuration_is_one_clear_error(tmp_path, changes):
         MergeNet(Architecture(width=config.width, cell_width=config.cell_width)), config
     )
     with pytest.raises(CheckpointError) as caught:
-        state.load(path, config)
+        state.load(path)
     assert str(caught.value) == (
         f"{path}: the state belongs to a training run with another configuration "
         f"({name} differs); restore the setting, or train to another output"
@@ -160,7 +160,7 @@ def test_a_training_with_a_restart_is_not_told_to_restart(tmp_path):
     """It cannot go on once more."""
     restarted = CONFIG.model_copy(update={"steps": 10, "restart_step": 5})
     path = tmp_path / "a.state"
-    stepped(TrainState(small_net(), restarted), 10).save(path, restarted)
+    stepped(TrainState(small_net(), restarted), 10).save(path)
     longer = restarted.model_copy(update={"steps": 15, "restart_step": 10})
     with pytest.raises(CheckpointError) as caught:
         loaded(path, longer)
@@ -183,11 +183,11 @@ def test_the_start_may_move_but_not_change(tmp_path):
         info = CheckpointInfo(architecture=small_net().architecture, preset="standard", seed=seed)
         start.write_bytes(encode_checkpoint(small_net(), info))
     first, moved, other = (CONFIG.model_copy(update={"start": start}) for start in starts)
-    TrainState(small_net(), first).save(path, first)
-    TrainState(small_net(), moved).load(path, moved)
+    TrainState(small_net(), first).save(path)
+    TrainState(small_net(), moved).load(path)
     for config in (other, CONFIG):
         with pytest.raises(CheckpointError, match=r"another configuration \(start differs\)"):
-            TrainState(small_net(), config).load(path, config)
+            TrainState(small_net(), config).load(path)
 
 
 def test_a_state_of_other_settings_is_of_another_version(tmp_path):
@@ -225,10 +225,10 @@ SCENES = (LearnedScene(name="room", count=5, sha256="ab"), LearnedScene(name="ex
 def test_other_scenes_are_one_clear_error(tmp_path, scenes, odd):
     """Otherwise the checkpoint would name scenes that only the last steps saw."""
     path = tmp_path / "a.state"
-    TrainState(small_net(), CONFIG, SCENES).save(path, CONFIG)
-    TrainState(small_net(), CONFIG, SCENES).load(path, CONFIG)
+    TrainState(small_net(), CONFIG, SCENES).save(path)
+    TrainState(small_net(), CONFIG, SCENES).load(path)
     with pytest.raises(CheckpointError) as caught:
-        TrainState(small_net(), CONFIG, scenes).load(path, CONFIG)
+        TrainState(small_net(), CONFIG, scenes).load(path)
     assert str(caught.value) == (
         f"{path}: the state belongs to a training run on other scenes, in another order or "
         f"with other cameras ({odd} differs); restore these, or train to another output."

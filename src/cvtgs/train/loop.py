@@ -142,23 +142,23 @@ def train(
     origins = {source.origin: None for source in sources}
     state = TrainState(_first_net(config).to(device), config, origins)
     if resumes:
-        state.load(files.state, config)
-        _restore_checkpoint(state, config, files)
+        state.load(files.state)
+        _restore_checkpoint(state, files)
     make_folder(files.cache)
     cases, validation_scenes = _prepare_scenes(sources, config, files.cache, listener)
     state.learn_range(summarize(case.descriptors) for case, _ in cases)
     copies = DeviceCopies(device)
     if not state.history.validations:
-        _validate(state, validation_scenes, math.nan, config, files, copies)
+        _validate(state, validation_scenes, math.nan, files, copies)
         on_validation(state.history)
     losses: list[float] = []
     with step_gradients(cases, config, files.cache, copies) as compute:
         while state.step < config.steps and state.history.since_best() < config.patience:
-            losses.append(_step(state, compute, config, files))
+            losses.append(_step(state, compute, files))
             listener(ProgressEvent(stage="train", done=state.step, total=config.steps))
             if state.step % config.validate_every == 0 or state.step == config.steps:
                 loss = sum(losses) / len(losses)
-                _validate(state, validation_scenes, loss, config, files, copies)
+                _validate(state, validation_scenes, loss, files, copies)
                 on_validation(state.history)
                 losses = []
     return state.history
@@ -276,14 +276,11 @@ def _case_gradient(
 
 
 def _step(
-    state: TrainState,
-    compute: Callable[[Net, int], list[CaseGradient]],
-    config: TrainConfig,
-    files: TrainFiles,
+    state: TrainState, compute: Callable[[Net, int], list[CaseGradient]], files: TrainFiles
 ) -> float:
     results = compute(state.net, state.step)
     for group in state.optimizer.param_groups:
-        group["lr"] = _learning_rate(config, state.step)
+        group["lr"] = _learning_rate(state.config, state.step)
     for parameter, *parts in zip(
         state.net.parameters(), *(result.gradients for result in results), strict=True
     ):
@@ -318,7 +315,6 @@ def _validate(
     state: TrainState,
     validation_scenes: Sequence[TrainingScene],
     loss: float,
-    config: TrainConfig,
     files: TrainFiles,
     copies: DeviceCopies,
 ) -> None:
@@ -330,9 +326,9 @@ def _validate(
             gains.append(Gain(scene=scene.name, ratio=case.ratio, decibels=after - before))
     history = state.history
     history.validations.append(Validation(step=state.step, loss=loss, gains=tuple(gains)))
-    if config.keep == "last" or history.since_best() == 0:
-        _write_checkpoint(state, config, files)
-    state.save(files.state, config)
+    if state.config.keep == "last" or history.since_best() == 0:
+        _write_checkpoint(state, files)
+    state.save(files.state)
     _draw_curves(history, files)
 
 
@@ -352,8 +348,9 @@ def _draw_curves(history: History, files: TrainFiles) -> None:
         warn(f"the curves are not saved: {error}")
 
 
-def _restore_checkpoint(state: TrainState, config: TrainConfig, files: TrainFiles) -> None:
+def _restore_checkpoint(state: TrainState, files: TrainFiles) -> None:
     """Write a missing checkpoint or image again; raise if the state is of another network."""
+    config = state.config
     if state.history.validations and not files.curves.is_file():
         _draw_curves(state.history, files)
     if files.checkpoint.is_file():
@@ -373,10 +370,11 @@ def _restore_checkpoint(state: TrainState, config: TrainConfig, files: TrainFile
             f"{files.checkpoint}: the network of the best validation is missing, and {files.state} "
             f"holds only a later one; restore the file, or train to another output."
         )
-    _write_checkpoint(state, config, files)
+    _write_checkpoint(state, files)
 
 
-def _write_checkpoint(state: TrainState, config: TrainConfig, files: TrainFiles) -> None:
+def _write_checkpoint(state: TrainState, files: TrainFiles) -> None:
+    config = state.config
     # Without paths, and without the note, which has its own field.
     settings = config.model_dump_json(exclude={"start": True, "note": True, "data": {"folders"}})
     info = CheckpointInfo(

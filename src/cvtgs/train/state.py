@@ -213,7 +213,7 @@ class TrainState:
     """A network in training: its weights, their running mean, the optimiser, the history."""
 
     def __init__(self, net: Net, config: TrainConfig, scenes: Iterable[LearnedScene] = ()) -> None:
-        self.net = net
+        self.net, self.config = net, config
         self.mean_net = copy.deepcopy(net).eval().requires_grad_(False)
         self.optimizer = torch.optim.AdamW(
             net.parameters(), lr=config.learning_rate, betas=(0.9, 0.98), weight_decay=0.0
@@ -222,7 +222,6 @@ class TrainState:
         self.scenes = tuple(scenes)
         self.start = "" if config.start is None else load_checkpoint(config.start).digest
         self.step = 0
-        self.averaged_steps = config.averaged_steps
 
     def learn_range(self, cases: Iterable[Tensor]) -> None:
         """Fit the known range of both networks, if they have one, to the summaries of all cases."""
@@ -232,12 +231,12 @@ class TrainState:
 
     def average(self) -> None:
         """Update the running mean of the weights."""
-        share = 1 - min(1 - 1 / self.averaged_steps, (self.step + 1) / (self.step + 10))
+        share = 1 - min(1 - 1 / self.config.averaged_steps, (self.step + 1) / (self.step + 10))
         with torch.no_grad():
             for average, now in zip(self.mean_net.parameters(), self.net.parameters(), strict=True):
                 average.lerp_(now, share)
 
-    def save(self, path: Path, config: TrainConfig) -> None:
+    def save(self, path: Path) -> None:
         """Write the state to a file."""
         tensors = add_prefix("net/", self.net.state_dict())
         tensors |= add_prefix("mean/", self.mean_net.state_dict())
@@ -246,14 +245,14 @@ class TrainState:
         record = {
             "step": self.step,
             "history": self.history.to_list(),
-            "config": _fingerprint(config, self.start),
+            "config": self._settings(),
             "version": cvtgs.__version__,
             "scenes": [scene.model_dump() for scene in self.scenes],
         }
         text = json.dumps(record)
         save_tensors(path, tensors, {"state": text, "sha256": tensors_digest(tensors, text)})
 
-    def load(self, path: Path, config: TrainConfig) -> None:
+    def load(self, path: Path) -> None:
         """Read the state from a file that :meth:`save` wrote."""
         try:
             tensors, metadata = map_tensors(path)
@@ -263,7 +262,7 @@ class TrainState:
                     f"{path}: the state was written by cvtgs {record['version']}, but this is "
                     f"{cvtgs.__version__}; remove it, or train to another output."
                 )
-            self._check_settings(path, record["config"], config)
+            self._check_settings(path, record["config"])
             self._check_scenes(path, record["scenes"])
             if metadata["sha256"] != tensors_digest(tensors, metadata["state"]):
                 raise ValueError("the content has another hash")
@@ -278,9 +277,21 @@ class TrainState:
                 f"{path}: the training state is damaged; remove it, or train to another output."
             ) from error
 
-    def _check_settings(self, path: Path, theirs: dict[str, Any], config: TrainConfig) -> None:
+    def _settings(self) -> dict[str, Any]:
+        """Return the settings that must not change between start and resume, by dotted key."""
+        # Paths may change: the scenes and the digest of the start are compared instead.
+        left_out = {"note": True, "patience": True, "data": {"folders"}}
+        settings: dict[str, Any] = {}
+        for key, value in self.config.model_dump(mode="json", exclude=left_out).items():
+            if isinstance(value, dict):
+                settings |= {f"{key}.{name}": inner for name, inner in value.items()}
+            else:
+                settings[key] = value
+        return settings | {"start": self.start}
+
+    def _check_settings(self, path: Path, theirs: dict[str, Any]) -> None:
         """Raise for other settings, but for a restart at the end of a finished training."""
-        ours = _fingerprint(config, self.start)
+        ours = self._settings()
         if set(theirs) != set(ours):
             raise CheckpointError(
                 f"{path}: the state was written by another version of cvtgs, which has other "
@@ -320,18 +331,3 @@ class TrainState:
         kept = {number: under_prefix(f"optimizer/{number}/", tensors) for number in range(count)}
         state["state"] = {number: values for number, values in kept.items() if values}
         self.optimizer.load_state_dict(state)
-
-
-def _fingerprint(config: TrainConfig, start: str) -> dict[str, Any]:
-    """Return the settings that must not change between start and resume, by dotted key."""
-    # Paths may change: the scenes and the digest of the start are compared instead.
-    values = config.model_dump(
-        mode="json", exclude={"note": True, "patience": True, "data": {"folders"}}
-    )
-    settings: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, dict):
-            settings |= {f"{key}.{name}": inner for name, inner in value.items()}
-        else:
-            settings[key] = value
-    return settings | {"start": start}
