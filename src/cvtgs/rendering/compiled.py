@@ -32,18 +32,14 @@ except (ImportError, OSError) as error:
 Array = NDArray[Any]  # floats, all of one dtype, which numba infers
 Ints = NDArray[Any]  # integers
 Bools = NDArray[Any]
-
+# Half-open pixel ranges: first column, end column, first row, end row
 PixelBox = tuple[int, int, int, int]
-"""Half-open pixel ranges: first column, end column, first row, end row."""
-
 F = TypeVar("F", bound=Callable[..., object])
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _TURN = threading.Lock()  # of threads of the program, where numba takes one loop at a time
-
-prange = numba.prange
-"""A range whose steps run in parallel in functions compiled by :func:`parallel`."""
+prange = numba.prange  # a range whose steps run in parallel in functions compiled by `parallel`
 
 
 def serial(function: F, **settings: bool) -> F:

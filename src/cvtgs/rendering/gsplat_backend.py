@@ -29,16 +29,12 @@ from cvtgs.rendering.backends import (
 from cvtgs.rendering.projection import DILATION, rows_are_finite, to_matrices
 from cvtgs.scene import GaussianScene
 
+# Largest number of Gaussians that are rendered at once, counted once for every camera
 TOGETHER = 1 << 22
-"""Largest number of Gaussians that are rendered at once, counted once for every camera."""
-
 PIXELS_TOGETHER = 1 << 22  # largest number of pixels that are rendered at once
-
+# Largest error of the probe's image and gradient, relative to their largest value. Pixels with
+# alpha near the cut-off of 1/255 may differ; a shift by half a pixel changes a third.
 PROBE_TOLERANCE = 0.02
-"""Largest error of the probe's image and gradient, relative to their largest value.
-
-Pixels with alpha near the cut-off of 1/255 may differ; a shift by half a pixel changes a third.
-"""
 
 
 def require(device: torch.device) -> None:

@@ -12,8 +12,8 @@ from cvtgs.rendering.compiled import Array, Bools, Ints, PixelBox, parallel, pra
 
 SLACK = 1e-3
 LOG_MIN_ALPHA = math.log(MIN_ALPHA)
+# Prime step between tiles. Neighbouring tiles cost alike, so this balances the threads.
 STRIDE = 1009
-"""Prime step between tiles. Neighbouring tiles cost alike, so this balances the threads."""
 
 
 @serial

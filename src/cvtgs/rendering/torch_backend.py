@@ -34,10 +34,8 @@ from cvtgs.scene import GaussianScene
 TILE = {"cpu": 8}  # pixels along a tile's edge, by device type; small tiles waste fewer operations
 
 _TILE_ELSEWHERE = 16
-
+# Pairs of splat and pixel per batch, by device type; small batches fit a CPU's caches
 CELLS = {"cpu": 1 << 18}
-"""Pairs of splat and pixel per batch, by device type; small batches fit a CPU's caches."""
-
 _CELLS_ELSEWHERE = 1 << 23
 
 _DEPTH = 32  # splats of each tile in one batch

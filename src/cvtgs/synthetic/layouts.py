@@ -189,6 +189,7 @@ def courtyard(rng: Random) -> list[Part]:
     ]
 
 
+# Layout function of every kind of scene
 LAYOUTS = {
     "object": single_object,
     "room": room,
@@ -197,7 +198,6 @@ LAYOUTS = {
     "thin": thin,
     "courtyard": courtyard,
 }
-"""Layout function of every kind of scene."""
 
 
 def _covered(surface: Surface, texture: Texture, share: float, material: Material = _MATTE) -> Part:

@@ -28,6 +28,7 @@ class SurfacePoints:
     rims: Float[Tensor, "n 2"]  # distance to the border along each texture coordinate
 
 
+# Faces of the unit cube: a corner, and the directions right and down as seen from outside
 _FACES = (
     ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
     ((1.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
@@ -36,11 +37,8 @@ _FACES = (
     ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
     ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
 )
-"""Faces of the unit cube: a corner, and the directions right and down as seen from outside."""
-
+# Function from points of the unit square to points of the surface
 Surface = Callable[[Float[Tensor, "n 2"]], SurfacePoints]
-"""Function from points of the unit square to points of the surface."""
-
 Heights = Callable[[Float[Tensor, "n 2"]], Float[Tensor, "n"]]  # height of the ground at x, z
 
 

@@ -11,13 +11,10 @@ from torch import Tensor
 from cvtgs.synthetic.surfaces import FACE_STEP
 
 Color = tuple[float, float, float]  # red, green, blue in [0, 1]
-
+# Function from texture coordinates to colours
 Texture = Callable[[Float[Tensor, "n 2"]], Float[Tensor, "n 3"]]
-"""Function from texture coordinates to colours."""
-
+# Function from texture coordinates to numbers in [0, 1]
 Mask = Callable[[Float[Tensor, "n 2"]], Float[Tensor, "n"]]
-"""Function from texture coordinates to numbers in [0, 1]."""
-
 _NOISE_TEXELS = 512
 _FONT = {
     "C": "01110 10001 10000 10000 10000 10001 01110",

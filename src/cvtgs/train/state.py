@@ -20,11 +20,11 @@ from cvtgs.mergenet import LearnedScene, MergeNet, Net, load_checkpoint
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.train.config import TrainConfig
 
+# Plotted statistics of the gains over all scenes, and their titles
 CURVES: tuple[tuple[Callable[[list[float]], float], str], ...] = (
     (mean, "mean gain, validation scenes"),
     (min, "gain of the worst validation scene"),
 )
-"""Plotted statistics of the gains over all scenes, and their titles."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -55,11 +55,9 @@ _PATH_RADIUS = 0.15
 _WALL_QUANTILE = 0.8  # of surface distances, a wall: the nearest are furniture, the farthest stray
 _FARTHEST = 1.5
 _FOUND = 2
-
-
+# A camera for every view and its distance to its subject; the first round has the preferred ones,
+# later ones have alternates
 Round = tuple[Cameras, Float[Tensor, "c"]]
-"""A camera for every view and its distance to its subject; the first round has the preferred ones,
-later ones have alternates."""
 
 
 def outside_candidates(

@@ -19,14 +19,12 @@ from cvtgs.views.up import VOXEL_SIZE, Voxels, among_others, find_floor, find_up
 ENCLOSED = 0.7  # least share of the upper hemisphere that a room hides from a camera in its middle
 FREE = 0.12  # clearance that a camera needs, in robust radii
 _NEAR = 2.2  # surfaces farther away than this, in robust radii, are not walls
+# Least correlation of size and distance of Gaussians in a room: Gaussians behind the surfaces,
+# where no image was taken, are large. In a hollow object, sizes shrink with distance.
 _GROWS = 0.1
-"""Least correlation of size and distance of Gaussians in a room: Gaussians behind the surfaces,
-where no image was taken, are large. In a hollow object, sizes shrink with distance."""
-
+# Largest share of the surfaces of a room that is behind others, seen from its middle; about 0.1 was
+# measured. Hollow objects have outer sides, a base and things beside them: 0.25 and more.
 _HIDDEN = 0.18
-"""Largest share of the surfaces of a room that is behind others, seen from its middle; about 0.1
-was measured. Hollow objects have outer sides, a base and things beside them: 0.25 and more."""
-
 _BEHIND = 1.3  # a surface over this many times as far, plus one voxel, is behind another
 _FARTHEST = 6.0
 _WALL_RAYS = 24  # level directions in which walls are searched
@@ -35,10 +33,9 @@ _REACHED = 0.75  # a line that passes a voxel within this many edges meets its s
 _MOST_POINTS = 10_000
 _CELLS = 10
 _LEAST_IN_CELL = 8
+# A room has Gaussians in at least so many cells of directions; small objects seem to grow in a few
+# by chance
 _LEAST_CELLS = 16
-"""A room has Gaussians in at least so many cells of directions; small objects seem to grow in a
-few by chance."""
-
 _BANDS = 5
 _SECTORS = 12
 

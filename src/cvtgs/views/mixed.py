@@ -16,10 +16,9 @@ from cvtgs.views.scoring import SMOOTH, splat_sizes
 
 TRIED = 3  # number of candidate views per returned view
 TOO_NEAR = 2.0  # a view is too close if upper-quartile distances are over this many times its own
+# A view shows fog if its splats, in robust radii, are larger than this many times those of the
+# sharpest tenth of the candidates, and larger than those of smooth sides
 FOGGY = 1.4
-"""A view shows fog if its splats, in robust radii, are larger than this many times those of the
-sharpest tenth of the candidates, and larger than those of smooth sides."""
-
 NEAR = (0.2, 1.4)  # range of distances of near views, robust radii; some views are inside the scene
 _AROUND = (1.1, 3.0)
 _FIELD = 50.0

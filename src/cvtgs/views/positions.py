@@ -58,9 +58,8 @@ _ASKED = 32
 _MEASURED = (16, 64)  # positions to look closely from: a few, then more where these see clutter
 _SAMPLE = 60_000
 _FEW = 20_000  # scenes of fewer Gaussians are coarse from everywhere
+# Heights above the middle of a room, robust radii, at half of which or more a wall has no gap
 _WALL_STEPS = (-0.15, -0.05, 0.05, 0.15)
-"""Heights above the middle of a room, robust radii, at half of which or more a wall has no gap."""
-
 _COARSE = 2.0  # the finest tenth of an image of clutter is over this many times that of clear ones
 _SUSPECT, _SUSPECTED = 0.03, 0.25
 _LARGE = 0.015  # least size of the finest splats of clutter, robust radii

@@ -22,10 +22,9 @@ _MOST_NEAR = 0.08
 _MOST_BLOCKED = 0.3
 _LEAST_FILLED = {False: 0.12, True: 0.8}  # least mean alpha, by whether the camera is inside a room
 _VISIBLE = 0.25
+# Largest splats of smooth sides that images were taken of, in robust radii. Sampling makes scenes
+# of any number of Gaussians comparable.
 SMOOTH = 0.05
-"""Largest splats of smooth sides that images were taken of, in robust radii. Sampling makes scenes
-of any number of Gaussians comparable."""
-
 _SPARSE = 4  # splats are measured on every fourth Gaussian of a sample, of four times the area
 _FEW = 20_000  # samples of fewer Gaussians are used whole
 _TOGETHER = 64  # cameras of which contributions are kept at a time
