@@ -253,7 +253,7 @@ def test_a_damaged_file_is_named(tmp_path):
 
 def test_a_block_is_a_gaussian_and_its_nearest_neighbours():
     scene = random_scene(60)
-    block = cut_block(scene, 20, seed=5)
+    block = cut_block(scene, random.Random(5), count=20)
     middle = scene.means[random.Random(5).randrange(60)]
     distances = (scene.means - middle).square().sum(dim=1)
     rows = torch.sort(distances).indices[:20].sort().values
@@ -263,7 +263,7 @@ def test_a_block_is_a_gaussian_and_its_nearest_neighbours():
 @pytest.mark.parametrize("count", [60, 61])
 def test_a_scene_that_is_no_larger_than_a_block_stays_whole(count):
     scene = random_scene(60)
-    assert cut_block(scene, count, seed=0) is scene
+    assert cut_block(scene, random.Random(0), count=count) is scene
 
 
 @pytest.mark.parametrize("seed", range(5))

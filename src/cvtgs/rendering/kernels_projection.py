@@ -95,13 +95,6 @@ def covariance_of(axes: Array, dilation: float) -> tuple[float, float, float, fl
 
 
 @serial
-def survival_of(axes: Array, dilation: float) -> float:
-    """Return the share of its opacity that an antialiased Gaussian keeps."""
-    _, _, _, schur, bare = covariance_of(axes, dilation)
-    return math.sqrt(bare / schur)
-
-
-@serial
 def color_of(
     sh: tuple[Array, Array], direction: Array, degree: int, basis: Array, out: Array
 ) -> None:
@@ -182,7 +175,8 @@ def project_all(
                 continue
             axes_of(rotation, log_scales[i], camera, local, axes)
             if antialiased:
-                opacity *= survival_of(axes, camera[8, 2])
+                _, _, _, schur, bare = covariance_of(axes, camera[8, 2])
+                opacity *= math.sqrt(bare / schur)
             if not (opacity >= MIN_ALPHA and splat_of(axes, local, camera, opacity, packed[i])):
                 continue
             normalize_in_place(offset)

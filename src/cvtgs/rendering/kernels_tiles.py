@@ -124,14 +124,6 @@ def tile_at(step: int, count: int) -> int:
 
 
 @serial
-def open_all(size: tuple[int, int], side: int, open_rows: Ints) -> None:
-    """Write a bit for every pixel of every tile, one integer per row."""
-    for tile in range(len(open_rows)):
-        x0, x1, y0, y1 = box_of(tile, side, size)
-        open_rows[tile, : y1 - y0] = (np.int64(1) << (x1 - x0)) - 1
-
-
-@serial
 def box_of(tile: int, side: int, size: tuple[int, int]) -> PixelBox:
     """Return the pixels of a tile, cropped to the image."""
     across = (size[0] + side - 1) // side

@@ -27,7 +27,7 @@ from cvtgs.rendering.kernels_blending import (
     light_of_gradient,
 )
 from cvtgs.rendering.kernels_projection import project_all, project_all_gradient
-from cvtgs.rendering.kernels_tiles import count_tiles, open_all, sort_by_tile, write_tiles
+from cvtgs.rendering.kernels_tiles import count_tiles, sort_by_tile, write_tiles
 from cvtgs.rendering.kernels_weights import TileWeights
 from cvtgs.rendering.projection import Pinhole, to_pinholes
 from cvtgs.scene import GaussianScene
@@ -163,9 +163,9 @@ def _start_image(
 
 def _open_rows(size: tuple[int, int]) -> NDArray[np.int64]:
     """Return a bit for each pixel of each tile, one integer per row of a tile."""
-    open_rows = np.zeros((-(-size[0] // SIDE) * -(-size[1] // SIDE), SIDE), np.int64)
-    open_all(size, SIDE, open_rows)
-    return open_rows
+    columns, rows = (np.minimum(SIDE, length - np.arange(0, length, SIDE)) for length in size)
+    is_row = np.arange(SIDE) < rows[:, None, None]
+    return np.where(is_row, (np.int64(1) << columns[:, None]) - 1, 0).reshape(-1, SIDE)
 
 
 def _project(gaussians: GaussianArrays, settings: RasterSettings) -> SplatArrays:

@@ -102,7 +102,10 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
 def _files_in(folder: Path) -> list[Path]:
     if not is_folder(folder):
         raise ConfigError(f"data.folders (--scenes): {folder} is not a folder.")
-    found = sorted(path for path in folder.rglob("*") if not _is_hidden(path, folder))
+    # Hidden are, for example, the blocks of an interrupted run.
+    names = [path.relative_to(folder) for path in folder.rglob("*")]
+    visible = [name for name in names if not any(part.startswith(".") for part in name.parts)]
+    found = sorted(folder / name for name in visible)
     files = [path for path in found if path.suffix.lower() == ".ply"]
     if not files:
         raise ConfigError(f"data.folders (--scenes): {folder} holds no PLY file.")
@@ -110,11 +113,6 @@ def _files_in(folder: Path) -> list[Path]:
     if others := [path.name for path in found if path.suffix.lower() in kinds]:
         warn(f"{folder}: training reads PLY files only, not {first_of(others)}.")
     return files
-
-
-def _is_hidden(path: Path, folder: Path) -> bool:
-    """Return whether a file is hidden in a folder, as the blocks of an interrupted run are."""
-    return any(part.startswith(".") for part in path.relative_to(folder).parts)
 
 
 def _from_files(
@@ -145,12 +143,9 @@ def _from_files(
         originals = [whole] if count <= config.largest_scene else []
         yield from originals
         for number in range(config.blocks if count > config.block_count else 0):
-            block = replace(
-                whole,
-                name=f"{name}-block{number}",
-                identity=f"{sha256} block {config.block_count} {seed + number}",
-                make=partial(_block_of, whole, config.block_count, seed + number),
-            )
+            key = f"block {config.block_count} {seed + number}"
+            cut = partial(cut_block, count=config.block_count)
+            block = _derived(whole, f"{name}-block{number}", key, cut, seed + number)
             originals.append(block)
             yield block
         if not originals:
@@ -158,7 +153,11 @@ def _from_files(
                 f"{path}: not used for training, since {count:,} Gaussians are above "
                 f"data.largest_scene, {config.largest_scene:,}, and no blocks are cut from it."
             )
-        yield from _copies(originals, config.copies, seed)
+        for original in originals:
+            for number in range(config.copies):
+                name = f"{original.name}-copy{number}"
+                key = f"copy {seed} {number}"
+                yield _derived(original, name, key, perturb, f"{seed}/{name}")
 
 
 def _digest(path: Path) -> str:
@@ -172,24 +171,19 @@ def _load_valid(path: Path) -> GaussianScene:
     return scene.with_tensors({name: x.float() for name, x in scene.tensors().items()})
 
 
-def _block_of(source: Source, count: int, seed: int) -> GaussianScene:
-    return cut_block(source.make(), count, seed=seed)
-
-
-def _perturbed(source: Source, seed: str) -> GaussianScene:
-    return perturb(source.make(), random.Random(seed))
-
-
-def _copies(originals: list[Source], count: int, seed: int) -> Iterator[Source]:
-    for original in originals:
-        for number in range(count):
-            name = f"{original.name}-copy{number}"
-            yield replace(
-                original,
-                name=name,
-                identity=f"{original.identity} copy {seed} {number}",
-                make=partial(_perturbed, original, f"{seed}/{name}"),
-            )
+def _derived(
+    source: Source,
+    name: str,
+    key: str,
+    change: Callable[[GaussianScene, random.Random], GaussianScene],
+    seed: int | str,
+) -> Source:
+    return replace(
+        source,
+        name=name,
+        identity=f"{source.identity} {key}",
+        make=lambda: change(source.make(), random.Random(seed)),
+    )
 
 
 def _generated(config: DataConfig, seed: int) -> Iterator[Source]:
@@ -211,11 +205,11 @@ def _generated(config: DataConfig, seed: int) -> Iterator[Source]:
                 )
 
 
-def cut_block(scene: GaussianScene, count: int, *, seed: int) -> GaussianScene:
+def cut_block(scene: GaussianScene, rng: random.Random, *, count: int) -> GaussianScene:
     """Cut a compact piece out of a scene: a random Gaussian and its nearest neighbours."""
     if len(scene) <= count:
         return scene
-    middle = scene.means[random.Random(seed).randrange(len(scene))]
+    middle = scene.means[rng.randrange(len(scene))]
     distances = torch.linalg.vector_norm(scene.means - middle, dim=1)
     return scene.select(distances.topk(count, largest=False).indices.sort().values)
 
@@ -308,13 +302,9 @@ def _cached(
 def _packed_views(all_views: Iterable[ViewImages]) -> dict[str, Tensor]:
     tensors: dict[str, Tensor] = {}
     for number, views in enumerate(all_views):
-        tensors |= {
-            f"{number}/viewmats": views.cameras.viewmats,
-            f"{number}/Ks": views.cameras.Ks,
-            f"{number}/ignores_tag": torch.tensor(views.cameras.ignores_tag, dtype=torch.bool),
-            f"{number}/rgb": views.rgb,
-            f"{number}/alpha": views.alpha,
-        }
+        own = {name: getattr(views.cameras, name) for name in ("viewmats", "Ks")}
+        own["ignores_tag"] = torch.tensor(views.cameras.ignores_tag, dtype=torch.bool)
+        tensors |= add_prefix(f"{number}/", own | {"rgb": views.rgb, "alpha": views.alpha})
     return tensors
 
 
@@ -344,11 +334,8 @@ def _packed_cases(cases: Iterable[Case | None]) -> dict[str, Tensor]:
             if reference.scene.antialiased:
                 tensors["antialiased"] = torch.ones(1)
         tensors |= add_prefix(prefix + "merged/", reference.merged.tensors())
-        described = case.descriptors
-        tensors |= {
-            f"{prefix}seen/{field.name}": getattr(described, field.name)
-            for field in fields(described)
-        }
+        seen = {field.name: getattr(case.descriptors, field.name) for field in fields(Descriptors)}
+        tensors |= add_prefix(prefix + "seen/", seen)
         tensors |= {
             prefix + "ratio": torch.tensor(case.ratio, dtype=torch.float64),
             prefix + "order": reference.partition.order,
