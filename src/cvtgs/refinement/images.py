@@ -93,12 +93,7 @@ def shared_views(
 
 
 def _further(
-    used: Cameras,
-    full: GaussianScene,
-    cameras: Cameras | None,
-    *,
-    config: RefineConfig,
-    seed: int,
+    used: Cameras, full: GaussianScene, cameras: Cameras | None, *, config: RefineConfig, seed: int
 ) -> Iterator[Cameras]:
     """Yield further training views; they are searched lazily."""
     if cameras is None:

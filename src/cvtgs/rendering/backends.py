@@ -63,12 +63,7 @@ class Backend(Protocol):
         ...
 
     def rasterize(
-        self,
-        scene: GaussianScene,
-        cameras: Cameras,
-        *,
-        sh_degree: int,
-        listener: ProgressListener,
+        self, scene: GaussianScene, cameras: Cameras, *, sh_degree: int, listener: ProgressListener
     ) -> RasterOutput:
         """Render images on black, on the device of the scene; cameras may be on any."""
         ...

@@ -20,12 +20,7 @@ from cvtgs.math.parameters import NEAR_PLANE
 from cvtgs.math.spherical_harmonics import REST_COUNTS, evaluate
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.rendering import torch_backend
-from cvtgs.rendering.backends import (
-    STAGE,
-    RasterOutput,
-    observe_in_two_passes,
-    without_gradients,
-)
+from cvtgs.rendering.backends import STAGE, RasterOutput, observe_in_two_passes, without_gradients
 from cvtgs.rendering.projection import DILATION, rows_are_finite, to_matrices
 from cvtgs.scene import GaussianScene
 
@@ -53,11 +48,7 @@ def require(device: torch.device) -> None:
 
 
 def rasterize(
-    scene: GaussianScene,
-    cameras: Cameras,
-    *,
-    sh_degree: int,
-    listener: ProgressListener = silent,
+    scene: GaussianScene, cameras: Cameras, *, sh_degree: int, listener: ProgressListener = silent
 ) -> RasterOutput:
     """Render in float32, several cameras at once if they treat pixels alike.
 

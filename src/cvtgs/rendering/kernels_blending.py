@@ -39,12 +39,7 @@ def reached_columns(splat: Array, room: float, box: PixelBox) -> int:
 
 @parallel
 def composite_all(
-    packed: Array,
-    tiles: TileArrays,
-    centers: Array,
-    image: Array,
-    open_rows: Ints,
-    weights: Array,
+    packed: Array, tiles: TileArrays, centers: Array, image: Array, open_rows: Ints, weights: Array
 ) -> None:
     """Blend splats into ``image``: red, green, blue, depth, and the transmittance left.
 
@@ -83,10 +78,7 @@ def blend_list(
 
 @serial
 def blend(
-    splat: Array,
-    box: PixelBox,
-    centers: Array,
-    state: tuple[Array, Ints],
+    splat: Array, box: PixelBox, centers: Array, state: tuple[Array, Ints]
 ) -> tuple[int, float]:
     """Blend a splat into a tile; return the number of pixels finished, and its summed weight."""
     (layers, open_rows), finished, total = state, 0, 0.0
@@ -248,11 +240,7 @@ def blend_gradient(
 
 @serial
 def blend_row_gradient(
-    splat: Array,
-    exponent: float,
-    ways: Array,
-    row: tuple[Array, Array, Array],
-    out: Array,
+    splat: Array, exponent: float, ways: Array, row: tuple[Array, Array, Array], out: Array
 ) -> tuple[int, float, float, float]:
     """Add gradients by colour and depth; return pixels finished and moments for the exponent."""
     finished = 0

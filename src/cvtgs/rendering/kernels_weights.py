@@ -72,11 +72,7 @@ def count_pixels(
 
 @parallel
 def write_weights(
-    packed: Array,
-    tiles: TileArrays,
-    size: tuple[int, int],
-    centers: Array,
-    weights: WeightArrays,
+    packed: Array, tiles: TileArrays, size: tuple[int, int], centers: Array, weights: WeightArrays
 ) -> None:
     """Blend without colours; write the weight of every splat in every pixel."""
     starts, lists, side = tiles

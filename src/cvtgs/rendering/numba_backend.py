@@ -46,11 +46,7 @@ def require(device: torch.device) -> None:
 
 
 def rasterize(
-    scene: GaussianScene,
-    cameras: Cameras,
-    *,
-    sh_degree: int,
-    listener: ProgressListener = silent,
+    scene: GaussianScene, cameras: Cameras, *, sh_degree: int, listener: ProgressListener = silent
 ) -> RasterOutput:
     """Render with compiled loops, without gradients up to four images at a time.
 

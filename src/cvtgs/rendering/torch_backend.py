@@ -61,11 +61,7 @@ def require(device: torch.device) -> None:
 
 
 def rasterize(
-    scene: GaussianScene,
-    cameras: Cameras,
-    *,
-    sh_degree: int,
-    listener: ProgressListener = silent,
+    scene: GaussianScene, cameras: Cameras, *, sh_degree: int, listener: ProgressListener = silent
 ) -> RasterOutput:
     """Render with torch operations only.
 
