@@ -8,6 +8,7 @@ free to use are unbounded; these have captured surfaces before backgrounds that 
 
 import argparse
 import json
+import random
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -50,7 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def placed(thing: GaussianScene, ground: GaussianScene, *, seed: int) -> GaussianScene:
     """Place an object on a piece of the ground, among generated surroundings."""
-    piece = upright(cut_block(ground, GROUND, seed=seed), radius=GROUND_RADIUS, level=0.5)
+    piece = upright(
+        cut_block(ground, random.Random(seed), count=GROUND), radius=GROUND_RADIUS, level=0.5
+    )
     center = upright(thing, radius=OBJECT_RADIUS, level=0.98)
     rest = far_surroundings(SURROUNDINGS, from_radius=GROUND_RADIUS, seed=seed)
     return edit.concatenate([without_tag(scene) for scene in (center, piece, rest)], fill=True)

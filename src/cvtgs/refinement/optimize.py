@@ -50,14 +50,12 @@ class Limits:
             raise InvalidArgumentError(
                 f"the refinement time in seconds must be above 0 and finite, found {seconds!r}."
             )
-        if steps is not None:
-            steps = checked_whole(steps, "the number of refinement steps")
         self._start = time.perf_counter()
         self._last = self._start
-        self.seconds: float | None = None
-        if seconds is not None:
-            self.seconds = float(seconds)  # also one of numpy
-        self._steps = steps
+        self.seconds = None if seconds is None else float(seconds)  # also one of numpy
+        self._steps = (
+            None if steps is None else checked_whole(steps, "the number of refinement steps")
+        )
         self._slowest = {"step": 0.0, "check": 0.0}
         self.steps: int = 0
 

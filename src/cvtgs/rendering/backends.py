@@ -40,19 +40,15 @@ class BlendingWeights(Protocol):
 
     def paint(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
         """Return the image on black for these colours of the Gaussians."""
-        ...
 
     def collect(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Return, for every Gaussian, the sum of the pixels times its weights."""
-        ...
 
     def normal(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Return ``collect(paint(colors))``."""
-        ...
 
     def powers(self) -> Float[Tensor, "n 2"]:
         """Return, for every Gaussian, the sum of its weights and of their squares."""
-        ...
 
 
 class Backend(Protocol):
@@ -60,27 +56,22 @@ class Backend(Protocol):
 
     def require(self, device: torch.device) -> None:
         """Raise DeviceError or MissingDependencyError unless the backend works on the device."""
-        ...
 
     def rasterize(
         self, scene: GaussianScene, cameras: Cameras, *, sh_degree: int, listener: ProgressListener
     ) -> RasterOutput:
         """Render images on black, on the device of the scene; cameras may be on any."""
-        ...
 
     def contributions(self, scene: GaussianScene, cameras: Cameras) -> Iterator[Tensor]:
         """Yield the sum of each Gaussian's weights ``alpha * T`` over every image."""
-        ...
 
     def observe(
         self, scene: GaussianScene, cameras: Cameras, *, sh_degree: int
     ) -> Iterator[tuple[RasterOutput, Tensor]]:
         """Yield every image on black, and the contributions to it."""
-        ...
 
     def blending_weights(self, scene: GaussianScene, camera: Cameras) -> BlendingWeights:
         """Return the weights of every Gaussian in the pixels of one image."""
-        ...
 
 
 def choose_backend(name: BackendName, device: torch.device) -> tuple[str, Backend]:

@@ -266,14 +266,9 @@ class _Placement:
         quats = torch.randn(count, 4, generator=generator, dtype=torch.float32)
         draws = torch.rand(count, 3, generator=generator, dtype=torch.float32)
         tiles = torch.arange(count)
-        positions = torch.stack(
-            [
-                apart * (tiles % side + 0.5 - side / 2) + 0.3 * (draws[:, 0] - 0.5),
-                apart * (tiles // side + 0.5 - side / 2) + 0.3 * (draws[:, 1] - 0.5),
-                torch.zeros(count),
-            ],
-            dim=1,
-        )
+        grid = torch.stack([tiles % side, tiles // side], dim=1)
+        flat = apart * (grid + 0.5 - side / 2) + 0.3 * (draws[:, :2] - 0.5)
+        positions = torch.nn.functional.pad(flat, (0, 1))
         zooms = torch.exp(math.log(2.0) * (draws[:, 2] - 0.5)) / TILE_WIDTH
         drawn = [parameters.normalize_quats(quats), zooms[:, None], positions]
         turns, sizes, places = torch.cat(drawn, dim=1).to(merged.means).split([4, 1, 3], dim=1)

@@ -280,9 +280,11 @@ class TrainState:
     def _settings(self) -> dict[str, Any]:
         """Return the settings that must not change between start and resume, by dotted key."""
         # Paths may change: the scenes and the digest of the start are compared instead.
-        left_out = {"note": True, "patience": True, "data": {"folders"}}
+        values = self.config.model_dump(
+            mode="json", exclude={"note": True, "patience": True, "data": {"folders"}}
+        )
         settings: dict[str, Any] = {}
-        for key, value in self.config.model_dump(mode="json", exclude=left_out).items():
+        for key, value in values.items():
             if isinstance(value, dict):
                 settings |= {f"{key}.{name}": inner for name, inner in value.items()}
             else:
