@@ -307,8 +307,9 @@ def _like(values: Float[Tensor, "n"], tensor: Tensor) -> Tensor:
 def learning_rate_scales(small: GaussianScene, full: GaussianScene) -> Float[Tensor, "n"]:
     """Return the learning-rate factor of each Gaussian, 0 to 1; invalid rows do not move.
 
-    Less for enclosed ones (:func:`cvtgs.analysis.ambient_visibility`), all that other views may
-    see; for those of few others, which are nearly right; and for large ones, which are fog.
+    Enclosed Gaussians (:func:`cvtgs.analysis.ambient_visibility`) move less, as they may be all
+    that other views see; so do those of few others, which are nearly right, and large ones, mostly
+    fog.
     """
     valid = valid_rows(small)
     some = small.select(valid)

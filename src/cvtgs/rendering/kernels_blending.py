@@ -43,7 +43,8 @@ def composite_all(
 ) -> None:
     """Blend splats into ``image``: red, green, blue, depth, and the transmittance left.
 
-    Unless ``weights`` is empty, write the sum of ``alpha * T`` of every intersection, in order.
+    A bit of ``open_rows`` is 0 where the pixel is finished. Unless ``weights`` is empty, write the
+    sum of ``alpha * T`` of every intersection of a splat and a tile, in splat order.
     """
     starts, lists, side = tiles
     height, width = image.shape[:2]
