@@ -261,7 +261,9 @@ def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
         if is_out_of_memory(error):
             raise
         kind = type(error).__name__
-        raise FileFormatError(f"{path}: must be an intact checkpoint, found a {kind}.") from error
+        raise FileFormatError(
+            f"{path}: must be an intact checkpoint, found damage ({kind})."
+        ) from error
     if splatfacto and scene.sh_degree == 0:
         colors = torch.sigmoid(scene.sh0)  # through which it trains them at this degree
         return scene.with_tensors({"sh0": (colors - 0.5) / SH_C0}, {})
