@@ -273,7 +273,8 @@ def _group(job: Job, workers: Workers, clock: StageClock) -> tuple[float, ...]:
         run(partial(seed, job), 0)
         moves, energies, least = 0, [math.inf], 1.0 - job.config.cvt.tolerance
         for iteration in range(iterations):
-            energies.append(sum(run(partial(accumulate, job, iteration), iteration + 1)))
+            found = run(partial(accumulate, job, iteration), iteration + 1)
+            energies.append(math.fsum(found))  # `sum` rounds differently from Python 3.12 on
             if energies[-1] >= least * energies[-2]:
                 break
             move_sites(job, iteration)
@@ -355,10 +356,11 @@ def report_blocks(
         refilled_cells=sum(report.refilled_cells for report in reports)
         + sum(int(part["refilled"]) for part in parts),
         mass_in=scan.mass,
-        mass_out=sum(report.mass_out for report in reports) + kept_mass,
+        mass_out=math.fsum([kept_mass, *(report.mass_out for report in reports)]),
         energies=energies or (reports[0].energies if reports else ()),
-        energy=sum(report.energy for report in reports)
-        + sum(float(part["energy"]) for part in parts),
+        energy=math.fsum(
+            [report.energy for report in reports] + [float(part["energy"]) for part in parts]
+        ),
         backend=reports[0].backend if reports else "none",
         checkpoint=checkpoint,
         plan=scan.plan,
