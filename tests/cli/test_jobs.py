@@ -322,7 +322,7 @@ def test_an_unknown_suffix_for_standard_output_is_refused(
             "found b'what'; save a scene in another format as a file, whose suffix gives the "
             "format.",
         ),
-        (b"ply\nx", "standard input: the PLY header must end with a line 'end_header'"),
+        (b"ply\nx", "standard input: the header must end with 'end_header', found none in 5 bytes"),
     ],
 )
 def test_standard_input_without_a_scene_is_refused(
