@@ -37,14 +37,16 @@ def cluster():
         yield found
 
 
-def test_a_scheduler_that_has_just_ended_has_no_workers(
+def test_a_scheduler_that_has_just_ended_is_not_asked_for_workers(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Its client knows of none, and does not even say so."""
     monkeypatch.setattr(distributed, "ANSWER_SECONDS", 0.1)
-    client = SimpleNamespace(scheduler=None, scheduler_info=lambda n_workers: {"type": "Scheduler"})
+    client = SimpleNamespace(
+        scheduler=None, status="connecting", scheduler_info=lambda n_workers: {"type": "Scheduler"}
+    )
     job = SimpleNamespace(path=lambda name: tmp_path / name)
-    with pytest.raises(RunError, match="ADDRESS: must have workers, found none"):
+    with pytest.raises(RunError, match="the scheduler or all of its workers are gone"):
         ClusterWorkers(cast("Any", client)).check(cast("Any", job))
 
 

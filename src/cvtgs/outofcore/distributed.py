@@ -175,6 +175,8 @@ class ClusterWorkers:
         deadline = time.monotonic() + ANSWER_SECONDS
         while not (addresses := self._addresses()):
             if time.monotonic() > deadline:
+                if self._client.status != "running":
+                    raise _gone()
                 where = self._client.scheduler.address if self._client.scheduler else "ADDRESS"
                 raise RunError(
                     f"{where}: must have workers, found none within {ANSWER_SECONDS:g} s; start "
