@@ -22,7 +22,7 @@ from cvtgs.errors import (
     warn,
 )
 from cvtgs.io.tensors import pack_tensors, tensors_digest, unpack_tensors
-from cvtgs.mergenet.model import Architecture, MergeNet
+from cvtgs.mergenet.model import Architecture, MergeNet, without_weights
 from cvtgs.mergenet.published import Net, PublishedArchitecture, PublishedMergeNet
 from cvtgs.text import printable_name, short_repr, shortened, shown
 
@@ -230,7 +230,7 @@ def build_network(architecture: Architecture | PublishedArchitecture) -> Net:
 
 
 def _build_net(info: CheckpointInfo, tensors: dict[str, Tensor]) -> Net:
-    with torch.device("meta"):  # draws no random numbers
+    with without_weights():
         net = build_network(info.architecture)
     if isinstance(net, MergeNet) and not any(key.startswith(KNOWN) for key in tensors):
         own = net.state_dict()
@@ -243,7 +243,7 @@ def _build_net(info: CheckpointInfo, tensors: dict[str, Tensor]) -> Net:
         raise CheckpointError(f"{OTHER}: {', '.join(odd[:3])} {verb} not fit.")
     if not all(bool(torch.isfinite(values).all()) for values in tensors.values()):
         raise CheckpointError("the checkpoint holds weights that are not finite.")
-    net.to_empty(device="cpu").load_state_dict(tensors)
+    net.load_state_dict(tensors)
     return net.eval().requires_grad_(False)
 
 

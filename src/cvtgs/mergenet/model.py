@@ -2,7 +2,9 @@
 
 import copy
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
@@ -34,7 +36,9 @@ CellWidth = Annotated[int, pydantic.Field(ge=1, le=4096)]
 LARGE_GROWTH = 0.6  # unit of changes of log scales in the cost of residuals
 LARGEST_LOGIT_CHANGE = 2.0  # largest change of an opacity logit
 LARGEST_TURN = 0.5  # largest rotation of a cell about each of its axes, in radians
-LARGEST_MEMBER_GATE, LARGEST_PAIR_GATE = 2.0, 0.5
+
+LARGEST_MEMBER_GATE = 2.0
+LARGEST_PAIR_GATE = 0.5
 
 LEAST_AREA = -4.5
 """Logarithm of the ratio of areas up to which a neighbour is too small to lend its colour; from 1
@@ -56,6 +60,8 @@ MEMBERS, MOST_MEMBERS = 9, 2000
 """Index of the feature ``0.2 log(members)``, and the number from which on corrections fade: larger
 cells, of unbounded scenes where most cells are spent on the sky, cover the cameras when they grow.
 """
+
+_TO_BE_LOADED = ContextVar("_TO_BE_LOADED", default=False)
 
 WIDEST = 1e30  # absolute value of both ends of the range before it is fitted
 
@@ -106,7 +112,11 @@ class Residuals:
     __repr__ = short_repr
 
     def cost(self) -> Float[Tensor, ""]:
-        """Return the mean square of all changes but colours, each in units of a large change."""
+        """Return the mean square of all changes but colours, each in units of a large change.
+
+        Returns:
+            A term of the training loss; 0 for no change.
+        """
         parts = [
             self.d_log_scales / LARGE_GROWTH,
             self.d_logit_opacities / LARGEST_LOGIT_CHANGE,
@@ -172,7 +182,14 @@ class MergeNet(CellNetwork):
         nn.init.zeros_(self.decoder.bias)
 
     def forward(self, descriptors: Descriptors) -> Residuals:
-        """Predict the residuals of some cells, each with at least one member."""
+        """Predict the residuals of some cells.
+
+        Args:
+            descriptors: Any number of cells, each with at least one member.
+
+        Returns:
+            Residuals of each cell.
+        """
         offsets, weights = descriptors.offsets, descriptors.weights
         ids, shape = segment_ids(offsets, len(weights)), descriptors.pairs.shape[:2]
         members = self.member_layers(descriptors.members)
@@ -243,11 +260,25 @@ class _Gates(nn.Module):
 
 
 class Linear(nn.Linear):
-    """A layer in float32 on the CPU, whatever other defaults the program has than ``meta``."""
+    """A layer in float32 on the CPU, whatever the defaults of the program, with random weights."""
 
     def __init__(self, features: int, width: int, *, bias: bool = True) -> None:
-        device = "meta" if torch.empty(0).is_meta else "cpu"
-        super().__init__(features, width, bias=bias, device=device, dtype=torch.float32)
+        super().__init__(features, width, bias=bias, device="cpu", dtype=torch.float32)
+
+    def reset_parameters(self) -> None:
+        """Draw random weights, unless they are going to be loaded."""
+        if not _TO_BE_LOADED.get():
+            super().reset_parameters()
+
+
+@contextmanager
+def without_weights() -> Iterator[None]:
+    """Build networks without weights in this thread, so that no random numbers are drawn."""
+    token = _TO_BE_LOADED.set(True)
+    try:
+        yield
+    finally:
+        _TO_BE_LOADED.reset(token)
 
 
 def two_layers(features: int, width: int) -> nn.Sequential:
@@ -266,7 +297,10 @@ def _pool_pairs(pairs: Float[Tensor, "m k w"]) -> tuple[Tensor, Tensor]:
 def _pulls(
     gates: Float[Tensor, "n 5"], positions: Float[Tensor, "n 3"], levers: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 6"]:
-    """Return by how much each row moves its cell, and turns it about each axis."""
+    """Return by how much each row moves its cell, and turns it about each axis.
+
+    The turn about an axis is proportional to the product of the other two coordinates.
+    """
     x, y, z = levers.unbind(1)
     twists = torch.stack([y * z, x * z, x * y])
     return torch.cat([gates.T[:1] * positions.T, gates.T[2:] * twists]).T
@@ -315,7 +349,14 @@ class KnownRange(nn.Module):
         self.register_buffer("margin", torch.ones_like(widest))
 
     def forward(self, summaries: Float[Tensor, "m f"]) -> Float[Tensor, "m"]:
-        """Return the factor, by :func:`summarize`, of every cell: 1 in range, 0 beyond margins."""
+        """Return the factor of the residual of every cell, 0 to 1.
+
+        Args:
+            summaries: Result of :func:`summarize`.
+
+        Returns:
+            Factors, exactly 1 within the range and exactly 0 beyond the margin.
+        """
         beyond = torch.maximum(self.low - summaries, summaries - self.high) / self.margin
         return (1 - beyond.amax(dim=1)).clamp(0, 1)
 

@@ -23,7 +23,9 @@ PUBLISHED_FEATURES = 3 + 3 + 4 + 1 + 1 + 3 * SH_COEFFICIENTS
 PUBLISHED_RESIDUALS = 3 + 3 + 3 + 1 + 3 * SH_COEFFICIENTS
 """Number of outputs of the decoder: position, log scale, rotation, opacity logit, SH."""
 
-LARGEST_FEATURE = 50.0  # limit of positions and differences of log scales, which stay finite
+LARGEST_FEATURE = 50.0
+"""Positions and differences of log scales are clamped to this, so that all values stay finite."""
+
 LARGEST_LOG = 80.0  # limit of a logarithm, whose exponential float32 holds
 
 
@@ -79,7 +81,10 @@ class PublishedResiduals:
 def describe_published(
     scene: GaussianScene, merged: GaussianScene, part: Partition, *, cells: Int[Tensor, "m"]
 ) -> PublishedDescriptors:
-    """Compute the descriptors of some cells as CVT-GS does; memory: about ``1 kB`` per member."""
+    """Compute the descriptors of some cells as CVT-GS does.
+
+    Memory: about ``1 kB`` per member.
+    """
     rows, ids = part.order, segment_ids(part.offsets, len(part.order))
     own = cells.index_select(0, ids)
     own_quats = parameters.normalize_quats(merged.quats).index_select(0, own)
@@ -141,7 +146,14 @@ class PublishedMergeNet(CellNetwork):
         nn.init.zeros_(self.residuals.bias)
 
     def forward(self, descriptors: PublishedDescriptors) -> PublishedResiduals:
-        """Predict the residuals of some cells, each with at least one member."""
+        """Predict the residuals of some cells.
+
+        Args:
+            descriptors: Any number of cells, each with at least one member.
+
+        Returns:
+            Residuals of each cell.
+        """
         offsets = descriptors.offsets
         members = self.member_layers(descriptors.members)
         pooled = [
