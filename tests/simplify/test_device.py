@@ -144,6 +144,8 @@ def test_short_chunks_are_used_where_long_ones_do_not_fit(monkeypatch, computed_
     for name in ("mergenet.apply", "cells.merge"):
         monkeypatch.setattr(f"cvtgs.{name}.CHUNK_MEMBERS", 64)
     monkeypatch.setattr(import_module("cvtgs.analysis.analyze"), "HALF_GRID", 8)
+    monkeypatch.setattr("cvtgs.cells.allocate.CHUNK", 1024)
+    monkeypatch.setattr("cvtgs.math.frames.GROUPED", 64)  # of a table of at most 2 MB otherwise
     scene = random_scene(3000, degree=0, size=0.02)
     wanted = Simplifier(device="cpu").simplify(scene, 0.02)
     # The weights of the network, 299,172 bytes, are copied at once and just fit.
