@@ -140,7 +140,10 @@ def test_tradeoff_against_photographs(folder, scenes, tmp_path, capsys):
         (["--size", "-3"], "--size must be from 1 to 16,384, found -3."),
         (["--size", "20000"], "--size must be from 1 to 16,384, found 20,000."),
         (["--split", "test"], "--split chooses among cameras and needs --cameras."),
-        (["--background", "1,2,3"], "background must be three numbers in [0, 1], found (1.0, 2."),
+        (
+            ["--background", "1,2,3"],
+            "--background must be red,green,blue from 0 to 1, or black, gray",
+        ),
         (["--background", "pink"], "--background must be 3 numbers red,green,blue from 0 to 1, or"),
         (["--cameras", "nowhere.json"], "nowhere.json: "),
     ],

@@ -147,7 +147,7 @@ def test_a_scene_that_fails_does_not_stop_the_others(
             ["a.ply", "a.spz", "-o", ".", "--suffix", "spz"],
             "the same name in ., found a.ply and a.spz.",
         ),
-        (["a.ply", "./a.ply", "-o", "out"], "the same name in out, found a.ply and a.ply."),
+        (["a.ply", "./a.ply", "-o", "out"], "every scene must be given once, found a.ply twice."),
         (["nothing*", "-o", "out"], "nothing*: the pattern must match a file, found none."),
         (["a.ply", "-o", "note"], "note: must be a folder or a new path, found: "),
         (["a.ply", "c.spz", "-o", "out", "--suffix", "xyz"], "--suffix must end in "),

@@ -157,7 +157,7 @@ def test_implausible_sizes_are_refused_in_one_sentence(tmp_path: Path) -> None:
     )
     sog(path, 100, method=zipfile.ZIP_BZIP2)
     assert refusal(path) == (
-        f"{path}: meta.json must be stored or deflated, found 12; zip it again."
+        f"{path}: meta.json must be stored or deflated, found method 12; zip it again."
     )
     path = tmp_path / "a.pt"
     torch.save({"splats": expanded(100)}, path)

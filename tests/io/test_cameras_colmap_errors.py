@@ -94,7 +94,7 @@ IMAGES_TXT: Mapping[str, tuple[str, str]] = {
     ),
     "unknown camera": (
         "1 1 0 0 0 0 0 5 8 a.jpg",
-        "the camera of 'a.jpg' must exist, found 8.",
+        "image 'a.jpg' must refer to a camera in the camera file, found camera 8.",
     ),
 }
 
@@ -124,16 +124,16 @@ def packed_image(
 BINARY: Mapping[str, tuple[str, bytes, str]] = {
     "empty": (
         "cameras", b"",
-        "the file is cut short: the count of cameras needs 8 bytes, found 0.",
+        "the file is cut short: the count of cameras must have 8 bytes, found 0.",
     ),
     "lying count of cameras": (
         "cameras", packed_cameras(count=1 << 60),
-        "the file is cut short: 1,152,921,504,606,846,976 cameras needs "
+        "the file is cut short: 1,152,921,504,606,846,976 cameras must have "
         "27,670,116,110,564,327,424 bytes, found 56.",
     ),
     "cut camera": (
         "cameras", packed_cameras()[:-1],
-        "the file is cut short: camera 0 needs 32 bytes, found 31.",
+        "the file is cut short: camera 0 must have 32 bytes, found 31.",
     ),
     "fisheye": (
         "cameras", packed_cameras(model=5),
@@ -152,11 +152,11 @@ BINARY: Mapping[str, tuple[str, bytes, str]] = {
     ),
     "lying count of images": (
         "images", packed_image(count=9),
-        "the file is cut short: 9 images needs 657 bytes, found 78.",
+        "the file is cut short: 9 images must have 657 bytes, found 78.",
     ),
     "lying count of points": (
         "images", packed_image(points=(1 << 64) - 1),
-        "the file is cut short: 18,446,744,073,709,551,615 points of image 0 needs "
+        "the file is cut short: 18,446,744,073,709,551,615 points of image 0 must have "
         "442,721,857,769,029,238,760 bytes, found 0.",
     ),
     "endless name": (

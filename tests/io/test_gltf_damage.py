@@ -117,7 +117,8 @@ DAMAGE: dict[str, tuple[Change, str]] = {
     ),
     "skewed": (
         lambda d: d.update(nodes=[{"mesh": 0, "scale": [1, 2, 1]}]),
-        "nodes must only rotate, move and scale uniformly, found a skew or mirror.",
+        "nodes must only rotate, move and uniformly scale Gaussians, found one that stretches, "
+        "skews or mirrors them.",
     ),
     "stride": (
         lambda d: d["bufferViews"][0].update(byteStride=4),

@@ -268,7 +268,7 @@ def test_integers_out_of_range_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError) as caught:
         load(tmp_path / "s.ply")
     assert str(caught.value).startswith(
-        f"{tmp_path}/s.ply: every value must be of the type of its property, found one not: "
+        f"{tmp_path}/s.ply: every value must be of the type of its property, found another: "
     )
 
 

@@ -238,11 +238,11 @@ def test_parameters_with_gradients_can_be_saved(tmp_path: Path) -> None:
         ),
         (
             {"extras": {"a b": torch.ones(2)}},
-            "column 'a b' must have no blanks, at most 200 letters.",
+            "column 'a b' must have a name of at most 200 letters without blanks.",
         ),
         (
             {"extras": {"a" * 201: torch.ones(2)}},
-            f"column {shown('a' * 201)} must have no blanks, at most 200 letters.",
+            f"column {shown('a' * 201)} must have a name of at most 200 letters without blanks.",
         ),
         (
             {"extras": {"q": torch.tensor([-1, 2**31])}},

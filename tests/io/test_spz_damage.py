@@ -159,7 +159,7 @@ def test_bands_above_the_third_are_left_out(tmp_path: Path) -> None:
     with pytest.warns(DroppedDataWarning) as caught:
         scene = load(path)
     assert str(caught[0].message) == (
-        f"{path}: left out the SH bands above degree 3 (of degree 4)."
+        f"{path}: left out the SH bands above degree 3 (the file has degree 4)."
     )
     assert caught[0].filename == __file__
     assert scene.sh_degree == 3
@@ -176,11 +176,11 @@ FOURTH_DAMAGED = {
     ),
     "table": (
         FOURTH[:16] + b"\xff\xff\xff\x7f" + FOURTH[20:],
-        "must hold 6 blocks, found a table of 6 at 2147483647.",
+        f"must hold 6 blocks, found a table of 6 at byte 2,147,483,647 of {len(FOURTH):,}.",
     ),
     "blocks": (
         FOURTH[:15] + b"\x03" + FOURTH[16:],
-        "must hold 6 blocks, found a table of 3 at 32.",
+        f"must hold 6 blocks, found a table of 3 at byte 32 of {len(FOURTH):,}.",
     ),
     "count": (
         FOURTH[:8] + b"\x29\x00\x00\x00" + FOURTH[12:],

@@ -48,6 +48,8 @@ def evaluation_settings(options: argparse.Namespace) -> "cvtgs.evaluation.Evalua
     word = options.background.strip().lower()
     of = f"red,green,blue from 0 to 1, or {', '.join(COLORS)}"
     red, green, blue = COLORS.get(word) or read_numbers("--background", word, 3, of=of)
+    if min(red, green, blue) < 0.0 or max(red, green, blue) > 1.0:
+        raise InvalidArgumentError(f"--background must be {of}, found {options.background!r}.")
     return cvtgs.evaluation.EvaluationSettings(
         background=(red, green, blue),
         lpips=getattr(options, "lpips", "auto"),

@@ -255,6 +255,8 @@ def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
     for source in sources:
         name = _output_name(source, options.suffix)
         before = named.setdefault(name.lower() if ignores_case else name, source)
+        if before is not source and before == source:
+            raise InvalidArgumentError(f"every scene must be given once, found {source} twice.")
         if before is not source:
             raise InvalidArgumentError(
                 f"two scenes must not have the same name in {options.folder}, found "

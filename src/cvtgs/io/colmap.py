@@ -72,7 +72,8 @@ def colmap_views(folder: Path, *, as_text: bool = False) -> list[View]:
     for image in images:
         if image.camera not in lenses:
             raise FileFormatError(
-                f"{path}: the camera of {shown(image.name)} must exist, found {image.camera}."
+                f"{path}: image {shown(image.name)} must refer to a camera in the camera file, "
+                f"found camera {image.camera}."
             )
     poses = np.array([image.pose for image in images], np.float64).reshape(-1, 7)
     viewmats = np.tile(np.eye(4), (len(images), 1, 1))
@@ -150,7 +151,8 @@ class _Bytes:
         left = os.fstat(self.file.fileno()).st_size - self.file.tell()
         if size > left:
             raise FileFormatError(
-                f"{self.path}: the file is cut short: {what} needs {size:,} bytes, found {left:,}."
+                f"{self.path}: the file is cut short: {what} must have {size:,} bytes, "
+                f"found {left:,}."
             )
 
 

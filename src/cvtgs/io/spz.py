@@ -122,7 +122,10 @@ def decode_spz(
     blocks, extensions = read(content, header, path)
     stated = _stated_axes(extensions, path)
     if degree > 3:
-        warn(f"{path}: left out the SH bands above degree 3 (of degree 4).", DroppedDataWarning)
+        warn(
+            f"{path}: left out the SH bands above degree 3 (the file has degree 4).",
+            DroppedDataWarning,
+        )
     colors = blocks["colors"].reshape(n, 3).astype(np.float32) / 255
     rest = blocks["sh"].reshape(n, _STORED_REST_COUNTS[degree], 3)[:, : REST_COUNTS[-1]]
     arrays = Arrays(
@@ -225,7 +228,8 @@ def _read_version_4(content: bytes, header: SpzHeader, path: Path | str) -> tupl
     is_whole = start >= _FOURTH_HEADER_BYTES and len(content) >= at
     if header.streams != len(sizes) or not is_whole:
         raise FileFormatError(
-            f"{path}: must hold {len(sizes)} blocks, found a table of {header.streams} at {start}."
+            f"{path}: must hold {len(sizes)} blocks, found a table of {header.streams} at byte "
+            f"{start:,} of {len(content):,}."
         )
     blocks = {"sh": np.empty(0, np.uint8)}
     entries = _TABLE_ENTRY.iter_unpack(content[start:at])

@@ -311,7 +311,10 @@ def _moved(file: GltfFile, scene: GaussianScene, matrix: Matrix) -> GaussianScen
         even = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_EVENNESS)
     affine = np.array_equal(matrix[3], [0, 0, 0, 1]) and bool(np.isfinite(matrix).all())
     if not even or not affine:
-        raise file.error("nodes must only rotate, move and scale uniformly, found a skew or mirror")
+        raise file.error(
+            "nodes must only rotate, move and uniformly scale Gaussians, found one that stretches, "
+            "skews or mirrors them"
+        )
     w, a, b, c = matrices_to_quats(torch.from_numpy(rotation)[None])[0].tolist()
     x, y, z = matrix[:3, 3].tolist()
     motion = Motion(quat=(w, a, b, c), scale=scale, shift=(x, y, z))

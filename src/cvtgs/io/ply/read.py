@@ -211,7 +211,7 @@ def _parsed_rows(file: BinaryIO, header: Header, vertex: Element, path: str) -> 
         raise FileFormatError(_explain(error, needed, path)) from error
     except (PlyParseError, ValueError, OverflowError) as error:
         raise FileFormatError(
-            f"{path}: every value must be of the type of its property, found one not: {error}."
+            f"{path}: every value must be of the type of its property, found another: {error}."
         ) from error
     rows: NDArray[Any] = data.view(np.ndarray)
     rows.dtype.names = tuple(prop.name for prop in vertex.properties)

@@ -127,7 +127,8 @@ def _check_names(scene: GaussianScene) -> None:
             )
         if name.split() != [name] or not is_name(name):
             raise InvalidSceneError(
-                f"column {shown(name)} must have no blanks, at most {MAX_NAME_LETTERS} letters."
+                f"column {shown(name)} must have a name of at most {MAX_NAME_LETTERS} letters "
+                f"without blanks."
             )
     for name, kind in scene.layout:
         if kind not in SCALARS:

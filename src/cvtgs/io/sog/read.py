@@ -348,7 +348,8 @@ def _read_inside(archive: zipfile.ZipFile, path: Path, name: str, most: int) -> 
         # of other methods, zipfile unpacks blocks whole
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise FileFormatError(
-                f"{where} must be stored or deflated, found {entry.compress_type}; zip it again."
+                f"{where} must be stored or deflated, found method {entry.compress_type}; zip it "
+                f"again."
             )
         _check_length(entry.file_size, most, where)
         with archive.open(entry) as member:
