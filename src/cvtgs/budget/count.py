@@ -195,18 +195,25 @@ def find_count(
             f"no simplified scene reaches {wanted}: the best one tried, with {nearest.count:,} of "
             f"{total:,} Gaussians, reaches {reached}."
         )
-    (small, report), quality = best
+    stages = tuple(join_costs([*costs, *clock.costs]))
+    return _found(*best, target=target, tried=tuple(tried), stages=stages)
+
+
+def _found(
+    simplified: Simplified,
+    quality: Tried,
+    *,
+    target: Target,
+    tried: tuple[Tried, ...],
+    stages: tuple[StageCost, ...],
+) -> Found:
+    """Join the best scene, its scores, and a report of the whole search."""
     scores = quality.model_dump(exclude={"count"})
     search = SearchReport(
-        metric=target.metric,
-        target=target.value,
-        tried=tuple(tried),
-        count=quality.count,
-        **scores,
+        metric=target.metric, target=target.value, tried=tried, count=quality.count, **scores
     )
-    stages = tuple(join_costs([*costs, *clock.costs]))
-    report = report.model_copy(update={"search": search, "stages": stages})
-    return Found(small, report, tried=search.tried, **scores)
+    report = simplified.report.model_copy(update={"search": search, "stages": stages})
+    return Found(simplified.scene, report, tried=tried, **scores)
 
 
 def heldout_scorer(full: GaussianScene, cameras: Cameras, *, listener: ProgressListener) -> Scorer:

@@ -126,20 +126,13 @@ def levels(options: argparse.Namespace) -> None:
     if not options.quiet:
         if views is not None:
             say_views(evaluation)
-        _print_index(index)
-        for level in made:
-            if level.report.shortfall:
-                say(shortfall_note(level.report))
+        _say_levels(index, made)
         if is_scored and cameras is not None and options.split != "test":
             say_wrapped(
                 "Levels were fitted to cameras of which some score, which favours them; with "
                 "--cameras and --split test, others do."
             )
-        older = {path.name for path in options.output.glob("rho_*")} - set(names)
-        older -= {options.input.name}
-        if older:
-            listed = ", ".join(map(printable, sorted(older)))
-            say_wrapped(f"Not in {cvtgs.levels.INDEX_NAME}, of an earlier run: {listed}.")
+        _say_older(options, names)
     small = {name: level.scene for name, level in zip(names, made, strict=True)}
     title = str(options.input) if options.input.name in small else options.input.name
     write_page(options, {title: scene, **small})
@@ -206,7 +199,8 @@ def _score(
     return cvtgs.evaluate(full, files, views, settings=settings, listener=listener)
 
 
-def _print_index(index: "cvtgs.levels.LevelsIndex") -> None:
+def _say_levels(index: "cvtgs.levels.LevelsIndex", made: "Sequence[cvtgs.Level]") -> None:
+    """Print the table of the levels, and which have fewer Gaussians than asked for."""
     say(f"{index.source}, {counted(index.source_count, 'Gaussian')}:")
     rows = [["", "Gaussians", "size", "error", "PSNR", "alpha", "seconds"]]
     for level in index.levels:
@@ -216,3 +210,14 @@ def _print_index(index: "cvtgs.levels.LevelsIndex") -> None:
         size = size_text(level.bytes)
         rows.append([level.file, f"{level.count:,}", size, error, psnr, alpha, seconds])
     say_table(rows)
+    for report in (level.report for level in made):
+        if report.shortfall:
+            say(shortfall_note(report))
+
+
+def _say_older(options: argparse.Namespace, names: Sequence[str]) -> None:
+    """Name the levels in the folder that an earlier run left there."""
+    older = {path.name for path in options.output.glob("rho_*")} - {*names, options.input.name}
+    if older:
+        listed = ", ".join(map(printable, sorted(older)))
+        say_wrapped(f"Not in {cvtgs.levels.INDEX_NAME}, of an earlier run: {listed}.")

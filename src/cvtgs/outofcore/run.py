@@ -22,7 +22,7 @@ from cvtgs.grouping import finer_count, most_cells
 from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES, checked_axes
 from cvtgs.io.locks import output_lock
-from cvtgs.io.ply import join_plys, open_rows
+from cvtgs.io.ply import PlyRows, join_plys, open_rows
 from cvtgs.outofcore.allocate import allocate, join
 from cvtgs.outofcore.images import (
     LEAST_CAMERAS,
@@ -153,12 +153,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         warn_of_writing(output, rows, target=target, memory=room, workers=workers)
     if simplifier.config.uses_images:
         room -= IMAGE_BYTES
-        if cameras is not None:
-            sample = read_sample(rows, SAMPLED)
-            check_seen(sample, cameras, name="the scene", is_sample=True)
-        elif source_axes in (None, SCENE_AXES):
-            own = find_own_cameras(read_sample(rows, SAMPLED), source)
-            cameras = None if own is None else own.cameras
+        cameras = _cameras_to_fit(cameras, rows, source, axes=source_axes)
     allocation = simplifier.config.allocation
     merging = finer_count(target, rows.count, allocation)
     job = Job(
@@ -199,6 +194,20 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         finally:
             if is_complete:  # also if the listener raises at the last event
                 job.remove()
+
+
+def _cameras_to_fit(
+    given: Cameras | None, rows: PlyRows, source: str | os.PathLike[str], *, axes: str | None
+) -> Cameras | None:
+    """Return the given cameras, which must show the scene, or those beside the source."""
+    if given is None and axes not in (None, SCENE_AXES):
+        return None
+    sample = read_sample(rows, SAMPLED)
+    if given is not None:
+        check_seen(sample, given, name="the scene", is_sample=True)
+        return given
+    own = find_own_cameras(sample, source)
+    return None if own is None else own.cameras
 
 
 def rows_per_range(count: int) -> int:

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -130,6 +131,62 @@ def run_task(
     return Run(task=task, path=path, cost=cost, report=found)
 
 
+def run_tasks(
+    tasks: Sequence[Task],
+    run: Callable[[Task], Run],
+    *,
+    unnamed: str,
+    listener: ProgressListener,
+) -> tuple[list[Run], list[Failure]]:
+    """Run all tasks, and warn of those that fail, without the folder ``unnamed`` in their reasons.
+
+    Raise if all fail.
+    """
+    runs, failures, warned = list[Run](), list[Failure](), set[str]()
+    for done, task in enumerate(tasks):
+        listener(ProgressEvent(stage=STAGE, done=done, total=len(tasks), note=task.name))
+        try:
+            runs.append(run(task))
+        except RunError as error:
+            reason = str(error).replace(unnamed, "") if unnamed else str(error)
+            failures.append(
+                Failure(name=task.name, preset=task.preset, rho=task.rho, reason=reason)
+            )
+        else:
+            pass_warnings_on(runs[-1].cost.errors, warned)
+    listener(ProgressEvent(stage=STAGE, done=len(tasks), total=len(tasks)))
+    if failures and not runs:
+        raise RunError(f"every run failed; {failures[0].name}: {failures[0].reason}")
+    for failure in failures:
+        warn(f"{failure.name} failed: {failure.reason}")
+    return runs, failures
+
+
+def count_shared(views: Cameras, training: Path | None) -> int:
+    """Count the views that the training split has, too, which presets with images learn from."""
+    learned = load_cameras(training, split="train").viewmats.tolist() if training else []
+    return sum(pose in learned for pose in views.viewmats.tolist())
+
+
+def results_of(runs: Sequence[Run], comparison: Comparison) -> tuple[TradeoffResult, ...]:
+    """Join the costs and the scores of every run, and mark what nothing else surpasses."""
+    results = [
+        TradeoffResult(
+            name=run.task.name,
+            preset=run.task.preset,
+            rho=run.task.rho,
+            count=scores.count,
+            bytes=comparison.sizes[run.task.name],
+            seconds=run.cost.wall_seconds,
+            peak_memory_bytes=run.cost.peak_memory_bytes,
+            report=run.report,
+            **scores.means(),
+        )
+        for run, scores in zip(runs, comparison.evaluation.scenes, strict=True)
+    ]
+    return tuple(with_fronts(results))
+
+
 class Measured(NamedTuple):
     """The measurements, and images of the scenes.
 
@@ -218,8 +275,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
     truths = None if photographs is None else photographs(views)
     check_scores(full, views, photographs=truths, settings=settings, name=source_name)
     training = own.source if own is not None and own.test_cameras() is not None else None
-    learned = load_cameras(training, split="train").viewmats.tolist() if training else []
-    shared = sum(pose in learned for pose in views.viewmats.tolist())
+    shared = count_shared(views, training)
     if shared and any(task.uses_images for task in tasks):
         warn(
             f"presets that use images are fitted to {shared} of the {counted(len(views), 'view')} "
@@ -229,31 +285,16 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
     with kept or TemporaryDirectory(prefix="cvtgs-") as name:
         place = Path(name)
         start = start_seconds()
-        runs, failures, warned = list[Run](), list[Failure](), set[str]()
-        for done, task in enumerate(tasks):
-            listener(ProgressEvent(stage=STAGE, done=done, total=len(tasks), note=task.name))
-            try:
-                run = run_task(
-                    source,
-                    task,
-                    place,
-                    training=training,
-                    device=str(device),
-                    trust_sizes=trust_sizes,
-                )
-            except RunError as error:
-                reason = str(error) if kept else str(error).replace(f"{place}{os.sep}", "")
-                failures.append(
-                    Failure(name=task.name, preset=task.preset, rho=task.rho, reason=reason)
-                )
-            else:
-                runs.append(run)
-                pass_warnings_on(run.cost.errors, warned)
-        listener(ProgressEvent(stage=STAGE, done=len(tasks), total=len(tasks)))
-        if failures and not runs:
-            raise RunError(f"every run failed; {failures[0].name}: {failures[0].reason}")
-        for failure in failures:
-            warn(f"{failure.name} failed: {failure.reason}")
+        run = partial(
+            run_task,
+            source,
+            folder=place,
+            training=training,
+            device=str(device),
+            trust_sizes=trust_sizes,
+        )
+        unnamed = "" if kept else f"{place}{os.sep}"
+        runs, failures = run_tasks(tasks, run, unnamed=unnamed, listener=listener)
         sizes = {run.task.name: run.path.stat().st_size for run in runs}
         comparison = compare(
             full,
@@ -265,20 +306,6 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
             settings=settings,
             listener=listener,
         )
-    results = [
-        TradeoffResult(
-            name=run.task.name,
-            preset=run.task.preset,
-            rho=run.task.rho,
-            count=scores.count,
-            bytes=sizes[run.task.name],
-            seconds=run.cost.wall_seconds,
-            peak_memory_bytes=run.cost.peak_memory_bytes,
-            report=run.report,
-            **scores.means(),
-        )
-        for run, scores in zip(runs, comparison.evaluation.scenes, strict=True)
-    ]
     tradeoff = Tradeoff(
         source=source_name,
         source_count=len(full),
@@ -287,7 +314,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         machine=f"{device_name(where)}, {os.cpu_count()} cores, "
         f"Python {platform.python_version()}, torch {torch.__version__}",
         evaluation=comparison.evaluation,
-        results=tuple(with_fronts(results)),
+        results=results_of(runs, comparison),
         failures=tuple(failures),
         held_out=training is not None and not shared,
     )
