@@ -110,7 +110,7 @@ def test_info_lists_every_effect_with_its_evidence(source, capsys):
         assert " on if " in lines[name]
     assert lines["effect"].split() == ["effect", "state", "measured", "rule"]
     assert "on, to degree 2 " in lines["sh"]
-    assert "on, by setting " in lines["haze"]
+    assert "off, by setting " in lines["haze"], "there is none"
     assert "forced" not in lines["sh"]
 
 

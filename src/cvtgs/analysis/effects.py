@@ -184,7 +184,7 @@ def plan_haze(share: float, config: SimplifyConfig) -> Effect:
     choice, most = config.effects.haze, config.filter.max_mass_share
     below = config.filter.min_opacity
     return Effect(
-        active=share > most if choice == "auto" else choice == "on",
+        active=share > (most if choice == "auto" else 0.0) and choice != "off",
         figure=share,
         meaning=f"on if more than {most:g} of the apparent mass has an opacity below {below:g}",
         forced=choice != "auto",
