@@ -375,8 +375,11 @@ def test_what_is_never_drawn_is_no_haze():
 
 def test_masses_of_other_gaussians_are_refused():
     scene = random_scene(5)
-    with pytest.raises(InvalidArgumentError, match="distances must be one number for each"):
-        plan_effects(scene, scene.masses, distances=torch.ones(4))
+    for masses, found in ((scene.masses, "distances must be a tensor"), (torch.ones(4), "masses")):
+        with pytest.raises(InvalidArgumentError, match=found):
+            plan_effects(scene, masses, distances=torch.ones(4))
+    with pytest.raises(InvalidArgumentError, match="config must be of type SimplifyConfig or None"):
+        plan_effects(scene, scene.masses, distances=torch.ones(5), config={})
 
 
 @pytest.mark.parametrize("count", [2000, 50_000])

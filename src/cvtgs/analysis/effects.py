@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from cvtgs.checks import checked
 from cvtgs.config import EffectsConfig, SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.devices import chunk_length
@@ -95,6 +96,7 @@ class EffectPlan(Record):
     visibility: Effect
 
 
+@checked
 def plan_effects(
     scene: GaussianScene,
     masses: Float[Tensor, "n"],
@@ -117,7 +119,7 @@ def plan_effects(
         The plan.
 
     Raises:
-        InvalidArgumentError: Tensors have different lengths.
+        InvalidArgumentError: An argument has another type or shape.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -128,10 +130,8 @@ def plan_effects(
     config = config or SimplifyConfig()
     choices = config.effects
     apparent = masses if apparent_masses is None else apparent_masses
-    given = {"masses": masses, "apparent_masses": apparent, "distances": distances}
-    for name, values in given.items():
-        if values.shape != scene.logit_opacities.shape:
-            raise InvalidArgumentError(f"{name} must be one number for each Gaussian of the scene.")
+    if masses.shape != scene.logit_opacities.shape:  # and so all others
+        raise InvalidArgumentError("masses must be one number for each Gaussian of the scene.")
     opacities = scene.opacities
     shares = [
         far_share(distances, masses * drawn_rows(opacities)),
