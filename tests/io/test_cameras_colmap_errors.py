@@ -46,6 +46,10 @@ CAMERAS_TXT: Mapping[str, tuple[str, str]] = {
         "1 SIMPLE_RADIAL 64 48 9 9 9 nan",
         "the distortion must be finite, found nan.",
     ),
+    "twice": (
+        "1 PINHOLE 64 48 9 9 9 9\n1 PINHOLE 64 48 8 8 8 8",
+        "each camera must have a number of its own, found 1 again.",
+    ),
     "size": (
         "1 PINHOLE 64 99999999 9 9 9 9",
         "an image must have 1 to 1,048,576 pixels per side and at most 268,435,456 in all, "
@@ -57,10 +61,11 @@ CAMERAS_TXT: Mapping[str, tuple[str, str]] = {
 @pytest.mark.parametrize("case", CAMERAS_TXT)
 def test_damage_of_cameras_txt_is_one_sentence(case, tmp_path) -> None:
     colmap_txt(tmp_path)
-    line, wanted = CAMERAS_TXT[case]
+    lines, wanted = CAMERAS_TXT[case]
     path = tmp_path / "cameras.txt"
-    path.write_text(f"# a comment\n\n{line}\n")
-    assert camera_refusal(tmp_path) == f"{path}: line 3: {wanted}"
+    path.write_text(f"# a comment\n\n{lines}\n")
+    number = 3 + lines.count("\n")
+    assert camera_refusal(tmp_path) == f"{path}: line {number}: {wanted}"
 
 
 IMAGES_TXT: Mapping[str, tuple[str, str]] = {
@@ -144,6 +149,10 @@ BINARY: Mapping[str, tuple[str, bytes, str]] = {
         "cameras", packed_cameras(model=99),
         "camera 0: the camera model must be one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, "
         "OPENCV, FULL_OPENCV, found number 99; use colmap image_undistorter first.",
+    ),
+    "twice": (
+        "cameras", packed_cameras(count=2) + packed_cameras()[8:],
+        "camera 1: each camera must have a number of its own, found 7 again.",
     ),
     "width": (
         "cameras", packed_cameras(width=1 << 63),

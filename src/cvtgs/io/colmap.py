@@ -97,6 +97,13 @@ def _checked_image(name: str, camera: int, *, pose: Sequence[float], where: str)
     return _Image(name, camera, pose)
 
 
+def _check_new(camera: int, lenses: Mapping[int, Lens], where: str) -> None:
+    if camera in lenses:
+        raise FileFormatError(
+            f"{where}: each camera must have a number of its own, found {camera} again."
+        )
+
+
 def _find_model(name: str, where: str) -> _Model:
     if name not in _MODELS:
         raise FileFormatError(
@@ -163,6 +170,7 @@ def _cameras_of_bin(path: Path) -> dict[int, Lens]:
         for row in range(data.count("cameras", least=_CAMERA.size)):
             camera, number, width, height = data.take(_CAMERA, f"camera {row}")
             where = f"{path}: camera {row}"
+            _check_new(camera, lenses, where)
             is_known = 0 <= number < len(_NAMES)
             model = _find_model(_NAMES[number] if is_known else f"number {number}", where)
             layout = struct.Struct(f"<{model.parameters}d")
@@ -201,6 +209,7 @@ def _cameras_of_txt(path: Path) -> dict[int, Lens]:
                 parameters = [float(word) for word in words[4:]]
             except ValueError as error:
                 raise _wrong(where, "a camera with numeric fields", line) from error
+            _check_new(camera, lenses, where)
             if len(parameters) != model.parameters:
                 raise _wrong(where, f"a {words[1]} camera with {model.parameters} parameters", line)
             lenses[camera] = _lens_of(model, parameters, width=width, height=height, where=where)
