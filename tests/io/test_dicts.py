@@ -220,7 +220,11 @@ def splats(count: int = 200, **changes: torch.Tensor) -> dict[str, torch.Tensor]
         ),
     ],
 )
-def test_values_that_look_activated_are_warned_about(changes, found):
+@pytest.mark.parametrize("first", [None, torch.nan, torch.inf])
+def test_values_that_look_activated_are_warned_about(changes, found, first):
+    if first is not None:  # a value that is no number hides nothing
+        for values in (changes := {name: rows.clone() for name, rows in changes.items()}).values():
+            values.view(-1)[len(values) // 2] = first
     with pytest.warns(UserWarning, match=re.escape(found)) as caught:
         from_dict(splats(**changes))
     assert len(caught) == 1

@@ -129,14 +129,17 @@ def from_dict(
 
 def _activated_values(scene: GaussianScene) -> list[str]:
     """Describe the scales and opacities of a scene that look activated instead of stored."""
-    if len(scene) < _FEWEST_JUDGED:
+    opacities, scales = (
+        values[values.isfinite()] for values in (scene.logit_opacities, scene.log_scales)
+    )
+    if min(len(opacities), len(scales)) < _FEWEST_JUDGED:
         return []
     found = []
-    least, most = (float(value) for value in scene.logit_opacities.aminmax())
+    least, most = (float(value) for value in opacities.aminmax())
     if 0 <= least < most <= 1:
         found.append(f"opacities from {least:.3g} to {most:.3g}")
-    least, most = (float(value) for value in scene.log_scales.aminmax())
-    if least > 0 and float(scene.log_scales.median()) < _SMALL_SCALE:
+    least, most = (float(value) for value in scales.aminmax())
+    if least > 0 and float(scales.median()) < _SMALL_SCALE:
         found.append(f"scales from {least:.3g} to {most:.3g}")
     return found
 
