@@ -171,7 +171,7 @@ def checked_whole(
     if number < least or (most is not None and number > most):
         limits = "above 0" if least else "at least 0"
         if most is not None:
-            limits = f"between {least} and the {most:,} {things}"
+            limits = f"between {least} and " + (f"the {most:,} {things}" if things else f"{most:,}")
         raise InvalidArgumentError(f"{name} must be a whole number {limits}, found {shown(value)}.")
     return number
 

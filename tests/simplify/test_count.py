@@ -9,7 +9,7 @@ import torch
 
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig, target_count
 from cvtgs.boxes import check_room
-from cvtgs.counts import read_count, read_ratio
+from cvtgs.counts import checked_whole, read_count, read_ratio
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
 from scenes import random_scene, same_bits
 
@@ -216,6 +216,13 @@ def test_counts_out_of_range_are_errors(count):
         f"count must be a whole number between 1 and the 5 Gaussians of the scene; "
         f"found {count!r}{hint}."
     )
+
+
+@pytest.mark.parametrize(("things", "limit"), [("", "1,000"), ("points", "the 1,000 points")])
+def test_limits_of_whole_numbers_name_what_is_counted_if_it_has_a_name(things, limit):
+    with pytest.raises(InvalidArgumentError) as caught:
+        checked_whole(2000, "count", most=1000, things=things)
+    assert str(caught.value) == (f"count must be a whole number between 1 and {limit}, found 2000.")
 
 
 def test_large_counts_are_grouped_in_errors():
