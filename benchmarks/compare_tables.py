@@ -7,6 +7,8 @@ from pathlib import Path
 from statistics import mean
 from typing import Literal
 
+from pydantic_core import to_json
+
 from benchmarks.quality import Quality, markdown_rows, mean_or_none
 from cvtgs.plots import Panel, Series, line_chart
 
@@ -58,14 +60,14 @@ def joined(first: Table, second: Table) -> Table:
 
 
 def results_json(table: Table) -> str:
-    """Return results as JSON text."""
+    """Return results as JSON text; as in reports, infinity is the string ``Infinity``."""
     records = [
         {"scene": scene, "method": method, "rho": rho, "result": result and asdict(result)}
         for scene, rows in table.items()
         for method, row in rows.items()
         for rho, result in row.items()
     ]
-    return json.dumps(records, indent=1) + "\n"
+    return to_json(records, indent=1, inf_nan_mode="strings").decode() + "\n"
 
 
 def read_results(path: Path) -> Table:
@@ -73,9 +75,12 @@ def read_results(path: Path) -> Table:
     table: dict[str, dict[str, dict[float, Result | None]]] = {}
     for record in json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []:
         found = record["result"]
-        result = found and Result(**{**found, "quality": Quality(**found["quality"])})
+        if found:
+            scores = found["quality"]
+            quality = Quality(**{**scores, "psnr": float(scores["psnr"])})  # infinity is a text
+            found = Result(**{**found, "quality": quality})
         row = table.setdefault(record["scene"], {}).setdefault(record["method"], {})
-        row[record["rho"]] = result
+        row[record["rho"]] = found
     return table
 
 

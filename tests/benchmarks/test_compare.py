@@ -1,6 +1,7 @@
 """The comparison from end to end on a tiny scene, and how its tables and plots are made."""
 
 import json
+import math
 import re
 import shutil
 import sys
@@ -204,12 +205,15 @@ def test_means_are_over_scenes_and_a_failure_leaves_a_dash():
 
 def test_results_are_joined_and_read_back_from_their_file(tmp_path):
     first = {"a": {"x": {0.1: result(20.0)}, "y": {0.1: result(10.0, lpips=0.5)}}}
-    second = {"a": {"x": {0.1: None, 0.01: result(30.0)}}, "b": {"z": {0.1: result(1.0)}}}
+    equal = {0.1: result(1.0), 1.0: result(math.inf)}
+    second = {"a": {"x": {0.1: None, 0.01: result(30.0)}}, "b": {"z": equal}}
     both = compare_tables.joined(first, second)
     assert both["a"]["x"] == {0.1: None, 0.01: result(30.0)}
     assert both["a"]["y"] == first["a"]["y"]
     assert compare_tables.methods_of(both) == ["x", "y", "z"]
-    (tmp_path / "results.json").write_text(compare_tables.results_json(both))
+    text = compare_tables.results_json(both)
+    json.loads(text, parse_constant=pytest.fail)  # which JSON lacks
+    (tmp_path / "results.json").write_text(text)
     assert compare_tables.read_results(tmp_path / "results.json") == both
     assert compare_tables.read_results(tmp_path / "none.json") == {}
 
