@@ -273,6 +273,24 @@ def test_the_best_preset_that_fits_is_chosen(model):
     assert choose_preset(work, 1e9, model=model).preset == CANDIDATES[-1]
 
 
+@pytest.mark.parametrize("count", [4, 50, 1000])
+def test_few_given_cameras_cost_fewer_images(model, count):
+    """Of 50 cameras, ``matched`` renders 32; ``high`` would render 72."""
+    work, views = Work(count=1_000_000, target=10_000), cvtgs.views.automatic_views
+    cameras = views(cvtgs.synthetic.scene("object", 300, seed=0), count, width=32, height=24)
+    costs = {}
+    for name in CANDIDATES:
+        images = str(min(count, preset(name).visibility.views))
+        config = cvtgs.SimplifyConfig.compose(
+            preset=name, settings={"visibility.views": images} if images != "0" else None
+        )
+        costs[name] = model.seconds(work, config)
+        found = choose_preset(work, 1.31 * costs[name], model=model, cameras=cameras)
+        assert found == (name, pytest.approx(costs[name]))
+    assert (costs["high"] < model.seconds(work, preset("high"))) is (count < 72)
+    assert (costs["matched"] < model.seconds(work, preset("matched"))) is (count < 32)
+
+
 def test_a_scene_is_accepted_in_place_of_work(model):
     scene = cvtgs.synthetic.scene("object", 300, sh_degree=2, seed=0)
     assert Work.of(scene, 3) == Work(count=300, target=3, colors=27)

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 import cvtgs
+from camera_files import inria, write_json
 from cvtgs.budget import CostModel
 from cvtgs.cli.goals import ChosenPreset, _seconds_to_write, choose_preset
 from cvtgs.cli.main import build_parser, main
@@ -72,6 +73,40 @@ def test_a_run_whose_file_takes_too_long_says_so(
     said = " ".join(capsys.readouterr().out.split())
     assert "Simplifying and writing took 10." in said
     assert "where 10.0 s were left; advice." in said
+
+
+def test_a_time_budget_counts_the_cameras_that_are_given_or_found(
+    scene: cvtgs.GaussianScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def note(*given: Any, cameras: cvtgs.Cameras | None, **named: Any) -> ChosenPreset:
+        counts.append(None if cameras is None else len(cameras))
+        return ChosenPreset("draft", "a reason.", 10.0, "advice")
+
+    counts: list[int | None] = []
+    monkeypatch.setattr("cvtgs.cli.simplify.choose_preset", note)
+    source, other = tmp_path / "a" / "in.ply", tmp_path / "other.json"
+    source.parent.mkdir()
+    cvtgs.io.save(scene, source)
+    words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.1", "--overwrite"]
+    words += ["--time-budget", "8s", "--quiet"]
+    assert main(words) == 0
+    write_json(source.parent / "cameras.json", inria())
+    assert main(words) == 0
+    write_json(other, inria()[:4])
+    assert main([*words, "--cameras", str(other)]) == 0
+    assert counts == [None, 10, 4]
+
+
+def test_few_cameras_leave_time_for_a_better_preset(
+    scene: cvtgs.GaussianScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each image takes 0.1 s: the 72 of `high` do not fit, ten do."""
+    rates = {"plan": {"once": 0.0}, "visibility": {"views_in": 0.1 / len(scene)}}
+    monkeypatch.setattr(cvtgs.budget, "cost_model", lambda *_, **__: CostModel(rates=rates))
+    monkeypatch.setattr("cvtgs.budget.calibrate.is_calibrated", lambda _: True)
+    cameras = cvtgs.views.automatic_views(scene, 10, width=32, height=24)
+    assert choose_preset(options(), scene, {}, silent).name == "matched"
+    assert choose_preset(options(), scene, {}, silent, cameras=cameras).name == "high"
 
 
 @pytest.mark.parametrize("name", ["out.ply", "out.sog"])

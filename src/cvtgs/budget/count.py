@@ -302,6 +302,7 @@ def choose_preset(
     count: int | None = None,
     settings: Mapping[str, str] | None = None,
     model: CostModel | None = None,
+    cameras: Cameras | None = None,
     with_images: bool = True,
 ) -> Choice:
     """Choose the best preset whose simplification fits a time.
@@ -318,6 +319,7 @@ def choose_preset(
             ``{"visibility.views": "0"}``.
         model: The cost of presets; None for :func:`cvtgs.budget.cost_model`, which measures it once
             on this machine.
+        cameras: Cameras to render from, if they are given: a few make fewer images than presets do.
         with_images: Whether presets that render images may be chosen, which need 400 MB more.
 
     Raises:
@@ -347,6 +349,8 @@ def choose_preset(
         raise InvalidArgumentError(f"model must be a CostModel with rates, found {shown(model)}.")
     known = cost_model() if model is None else model
     configs = {name: SimplifyConfig.compose(preset=name, settings=settings) for name in CANDIDATES}
+    if cameras is not None:
+        configs = {name: _with_views(one, most=len(cameras)) for name, one in configs.items()}
     costs = {
         name: known.seconds(work, config)
         for name, config in configs.items()
@@ -367,3 +371,9 @@ def choose_preset(
         )
     best = fitting[-1]
     return Choice(best, costs[best])
+
+
+def _with_views(config: SimplifyConfig, *, most: int) -> SimplifyConfig:
+    views = min(config.visibility.views, most)
+    visibility = config.visibility.model_copy(update={"views": views})
+    return config.model_copy(update={"visibility": visibility})

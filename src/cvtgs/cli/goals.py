@@ -81,6 +81,7 @@ def choose_preset(
     settings: Mapping[str, str],
     listener: "cvtgs.ProgressListener",
     *,
+    cameras: "cvtgs.Cameras | None" = None,
     with_images: bool = True,
 ) -> ChosenPreset:
     """Choose the best preset that fits into the remaining time budget, and into memory."""
@@ -109,7 +110,7 @@ def choose_preset(
     work, left = cvtgs.budget.Work.of(scene, target), budget - spent - writing
     try:
         choice = cvtgs.budget.choose_preset(
-            work, left, settings=settings, model=model, with_images=with_images
+            work, left, settings=settings, model=model, cameras=cameras, with_images=with_images
         )
     except GoalError as error:
         raise GoalError(f"{error} Of {budget:g} s, {parts}.") from error

@@ -270,20 +270,21 @@ def _simplify_in_memory(
     scene = read_scene(options, config, axes=axes.source, all_bands=search)
     if search:
         config = with_limited_bands(config, options.sh_degree)
-    cameras, chosen = read_cameras(options), None
+    cameras, own, chosen = read_cameras(options), None, None
+    if cameras is None and (config.uses_images or options.time_budget is not None):
+        own = own_cameras(options, scene, options.input)
+        cameras = None if own is None else own.cameras
     if options.time_budget is not None:
         rendering = cvtgs.SimplifyConfig(preset="matched")
         fits = options.memory is None or not needs_blocks(options, memory_of(options), rendering)
-        chosen = choose_preset(options, scene, settings, listener, with_images=fits)
+        chosen = choose_preset(
+            options, scene, settings, listener, cameras=cameras, with_images=fits
+        )
         config = cvtgs.SimplifyConfig.compose(preset=chosen.name, settings=settings)
         notes.append(chosen.reason)
-    if cameras is None and config.uses_images:
-        own = own_cameras(options, scene, options.input)
-        if own is not None:
-            cameras = own.cameras
-            notes.append(
-                f"Rendered from {counted(len(cameras), 'camera')} found in {own.source.resolve()}."
-            )
+    if own is not None and config.uses_images:
+        many = counted(len(own.cameras), "camera")
+        notes.append(f"Rendered from {many} found in {own.source.resolve()}.")
     simplifier = cvtgs.Simplifier(
         checkpoint_of(options),
         config=config,
