@@ -54,6 +54,7 @@ def test_an_environment_is_mentioned_only_if_there_is_one(
     [
         (["--stream", "sog", "--suffix", ".spz"], "--suffix cannot be used with --stream"),
         (["--stream", "sog", "--views", "4"], "--views cannot be used with --stream"),
+        (["--stream", "sog", "--no-scores"], "--no-scores cannot be used with --stream"),
         (["--chunk", "300"], "--chunk needs --stream."),
         (
             ["--stream", "3dtiles", "--environment", "9"],

@@ -77,7 +77,8 @@ def check_stream_options(options: argparse.Namespace) -> None:
             raise InvalidArgumentError(f"--{name} needs --stream{kind}{found}.")
     if options.stream is None:
         return
-    excluded = [name for name in ("viewer", "suffix") if getattr(options, name)] + scoring
+    given = (name for name in ("viewer", "suffix", "no_scores") if getattr(options, name))
+    excluded = [name.replace("_", "-") for name in given] + scoring
     if excluded:
         raise InvalidArgumentError(
             f"--{excluded[0]} cannot be used with --stream, which sets the format, is for viewers "
