@@ -49,6 +49,18 @@ def write_cameras(path: Path, count: int = 2) -> Path:
     return path
 
 
+@pytest.mark.parametrize(
+    "command", [["simplify", "{}/in.ply", "{}/out.ply"], ["levels", "{}/in.ply", "-o", "{}/out"]]
+)
+def test_workers_have_no_effect_on_a_scene_in_one_piece(capsys, source, command):
+    words = [word.format(source.parent) for word in command]
+    words += ["--rho", "0.1", "--preset", "draft", "--overwrite", "--workers", "2"]
+    words += ["--stream", "sog"] if command[0] == "levels" else []
+    note = "In one piece: --workers has an effect on blocks only."
+    assert note in printed(capsys, *words)
+    assert note not in printed(capsys, *words, "--quiet")
+
+
 def test_memory_has_no_effect_on_formats_that_are_read_whole(capsys, source):
     glb = source.with_name("in.glb")
     cvtgs.save(cvtgs.load(source), glb)
@@ -61,7 +73,7 @@ def test_a_whole_scene_is_copied_whatever_the_memory(capsys, source, monkeypatch
     monkeypatch.setattr("cvtgs.outofcore.memory.BASE_BYTES", 10)
     monkeypatch.setattr("cvtgs.outofcore.memory.LEAST_BYTES", 20)
     text = simplified(capsys, source, *words, "--memory", "20kB", "--workers", "1")
-    assert "blocks" not in text
+    assert "In one piece: --workers" in text
     assert source.with_name("out.ply").read_bytes() == source.read_bytes()
 
 

@@ -161,6 +161,16 @@ def needs_blocks(options: argparse.Namespace, memory: int, config: "cvtgs.Simpli
     return block_count(rows, memory, merging=merging) > 1
 
 
+def unused_block_options(options: argparse.Namespace) -> list[str]:
+    """Return notes on the options of blocks that had no effect on a scene in one piece."""
+    notes = []
+    if options.memory is not None and rows_of(options.input) is None:
+        notes.append("In one piece: --memory has an effect on binary .ply files only.")
+    if options.workers is not None:
+        notes.append("In one piece: --workers has an effect on blocks only.")
+    return notes
+
+
 def rows_of(path: Path) -> "PlyRows | None":
     """Open a binary PLY, which can be read in parts; return None for other files."""
     from cvtgs.io.ply import open_rows

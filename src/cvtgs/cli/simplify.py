@@ -13,8 +13,8 @@ from cvtgs.cli.blocks import (
     block_memory,
     memory_of,
     needs_blocks,
-    rows_of,
     simplify_blocks,
+    unused_block_options,
 )
 from cvtgs.cli.cameras import check_split, own_cameras, read_cameras
 from cvtgs.cli.display import TIE, progress_bars, report_notes
@@ -225,8 +225,8 @@ def _simplify_one(
         seconds = (f"{stage.stage}{TIE}{stage.seconds:.2f}" for stage in report.stages)
         of_what = " of all tries" if searched else ""
         notes.insert(0, f"Seconds{of_what}: {', '.join(seconds)}.")
-    if memory is None and options.memory is not None and rows_of(options.input) is None:
-        notes.append("In one piece: --memory has an effect on binary .ply files only.")
+    if memory is None:
+        notes += unused_block_options(options)
     if report.kept_count:
         notes.append(f"{counted(report.kept_count, 'Gaussian')} in the boxes of --keep.")
         name = options.output.name.lower()

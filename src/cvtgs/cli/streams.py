@@ -7,7 +7,13 @@ from functools import partial
 from itertools import zip_longest
 
 import cvtgs
-from cvtgs.cli.blocks import add_block_options, block_workers, check_block_device, memory_of
+from cvtgs.cli.blocks import (
+    add_block_options,
+    block_workers,
+    check_block_device,
+    memory_of,
+    unused_block_options,
+)
 from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped, shortfall_note
 from cvtgs.cli.options import checkpoint_of, read_numbers
 from cvtgs.errors import ConfigError, FileFormatError, InputError, InvalidArgumentError
@@ -212,8 +218,9 @@ def stream_levels(
     errors = [level.geometric_error for level in plan.levels]
     if made[0].report.shortfall and not options.quiet:
         say(shortfall_note(made[0].report))
-    if options.memory is not None and options.input.suffix.lower() != ".ply" and not options.quiet:
-        say("In one piece: --memory has an effect on binary .ply files only.")
+    if not options.quiet:
+        for note in unused_block_options(options):
+            say(note)
     _print_levels(options, len(plan.chunks), written, errors=errors)
 
 
