@@ -13,6 +13,7 @@ from cvtgs.devices import (
     chosen_device,
     chunk_length,
     device_name,
+    full_precision,
     in_chunks,
     move_together,
     usable_device,
@@ -195,3 +196,31 @@ def test_threads_take_tensors_of_inference_mode():
 
         in_chunks(add, 8, 2, torch.device("cpu"))
     assert bool((sums == 1).all())
+
+
+def test_fewer_bits_of_matrix_products_are_not_used():
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    try:
+        with full_precision():
+            assert torch.get_float32_matmul_precision() == "highest"
+        assert torch.get_float32_matmul_precision() == "medium"
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+@pytest.mark.skipif(
+    not hasattr(torch.backends.cuda.matmul, "fp32_precision"), reason="needs torch 2.9"
+)
+@pytest.mark.parametrize("kind", ["cuda", "mkldnn"])
+def test_fewer_bits_by_the_newer_setting_are_not_used_either(kind):
+    matmul = getattr(torch.backends, kind).matmul
+    before = matmul.fp32_precision
+    matmul.fp32_precision = "bf16" if kind == "mkldnn" else "tf32"
+    try:
+        chosen = matmul.fp32_precision
+        with full_precision():
+            assert matmul.fp32_precision == "ieee"
+        assert matmul.fp32_precision == chosen
+    finally:
+        matmul.fp32_precision = before

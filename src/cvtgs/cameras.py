@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cvtgs.checks import Rows, check_kinds, checked, row_numbers
 from cvtgs.counts import checked_whole, spread_rows, whole_number
-from cvtgs.devices import usable_device, without_autocast
+from cvtgs.devices import full_precision, usable_device
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.frames import unit_vectors
 from cvtgs.math.parameters import NEAR_PLANE
@@ -92,7 +92,7 @@ class Cameras:
         return self.names or tuple(f"view {number}" for number in range(1, len(self) + 1))
 
     @property
-    @without_autocast()
+    @full_precision()
     def centers(self) -> Float[Tensor, "c 3"]:
         """Positions of the cameras in the world, where renderers put them."""
         viewmats = self.viewmats.double()
@@ -259,7 +259,7 @@ class Cameras:
         modes = tuple(math.sqrt(2.0) * row % 1.0 < 1 / 3 for row in range(1, len(self) + 1))
         return replace(self, ignores_tag=modes)
 
-    @without_autocast()
+    @full_precision()
     @checked
     def shows_any(self, points: Float[Tensor, "n 3"]) -> bool:
         """Check whether any point lies within any of the images.
@@ -326,7 +326,7 @@ def view_scales(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "c"]:
     return torch.where((scales - 1).abs() > 1e-3, scales, 1.0)
 
 
-@without_autocast()
+@full_precision()
 @checked
 def look_at(
     eyes: Float[Tensor, "c 3"],

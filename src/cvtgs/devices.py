@@ -270,12 +270,26 @@ def _limit_own(before: int) -> None:
 
 
 @contextmanager
-def without_autocast() -> Iterator[None]:
-    """Compute in the dtypes of the tensors, even if the program has switched autocast on."""
+def full_precision() -> Iterator[None]:
+    """Compute in the dtypes of the tensors, even if the program allows fewer bits.
+
+    Such programs switch autocast on, or allow matrix products in TF32 or bfloat16.
+    """
     with ExitStack() as stack:
         for kind in ("cpu", "cuda"):
             if torch.is_autocast_enabled(kind):
                 stack.enter_context(torch.autocast(kind, enabled=False))
+        try:
+            before = torch.get_float32_matmul_precision()
+        except RuntimeError:  # the program has set it by the names of torch 2.9 and newer
+            for kind in ("cuda", "mkldnn"):
+                matmul = getattr(torch.backends, kind).matmul
+                stack.callback(setattr, matmul, "fp32_precision", matmul.fp32_precision)
+                matmul.fp32_precision = "ieee"
+        else:
+            if before != "highest":
+                stack.callback(torch.set_float32_matmul_precision, before)
+                torch.set_float32_matmul_precision("highest")
         yield
 
 

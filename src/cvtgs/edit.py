@@ -10,7 +10,7 @@ from torch import Tensor
 from cvtgs.boxes import Box, Corner, Sphere, inside, listed
 from cvtgs.checks import checked
 from cvtgs.counts import finite_numbers, real_number
-from cvtgs.devices import without_autocast
+from cvtgs.devices import full_precision
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError, warn
 from cvtgs.math.parameters import multiply_quats, rotation_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS, rotated_rest
@@ -185,7 +185,7 @@ def _kept(scene: GaussianScene, keep: Tensor) -> GaussianScene:
     return scene if bool(keep.all()) else scene.select(keep)
 
 
-@without_autocast()
+@full_precision()
 @checked
 def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
     """Rotate, scale and translate a scene; view-dependent colours and normals rotate with it.

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cvtgs.checks import check_kinds
 from cvtgs.counts import check_not_negative, real_number
-from cvtgs.devices import without_autocast
+from cvtgs.devices import full_precision
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import positive_log
 from cvtgs.text import counted
@@ -90,7 +90,7 @@ def mean_ssim(
     return _ssim(prediction - center, target - center, center=center.permute(0, 3, 1, 2))
 
 
-@without_autocast()
+@full_precision()
 def _ssim(
     prediction: Tensor, target: Tensor, *, center: Tensor | float = 0.0
 ) -> Float[Tensor, "c"]:

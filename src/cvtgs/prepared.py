@@ -16,7 +16,7 @@ from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shortfall, target_count
-from cvtgs.devices import chosen_device, threads_for_chunks, within_memory, without_autocast
+from cvtgs.devices import chosen_device, full_precision, threads_for_chunks, within_memory
 from cvtgs.edit import concatenate
 from cvtgs.errors import BLOCKS_ADVICE, InvalidArgumentError, memory_errors
 from cvtgs.grouping import OrderedRows, add_neighbors, importance_by_errors, order_rows
@@ -131,7 +131,7 @@ class Prepared:
             threads_for_chunks(),
             torch.inference_mode(mode=False),  # a refinement needs gradients of its own
             torch.no_grad(),
-            without_autocast(),
+            full_precision(),
             memory_errors(work, BLOCKS_ADVICE),
         ):
             return within_memory(compute_on, self._device, work=work, may_leave=self._may_leave)

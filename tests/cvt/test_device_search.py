@@ -116,32 +116,6 @@ def test_entries_of_like_numbers_or_few_together_share_a_group():
     ]  # fmt: skip
 
 
-def test_fewer_bits_of_matrix_products_are_not_used():
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("medium")
-    try:
-        with device_search._full_float32():
-            assert torch.get_float32_matmul_precision() == "highest"
-        assert torch.get_float32_matmul_precision() == "medium"
-    finally:
-        torch.set_float32_matmul_precision(before)
-
-
-@pytest.mark.skipif(
-    not hasattr(torch.backends.cuda.matmul, "fp32_precision"), reason="needs torch 2.9"
-)
-def test_fewer_bits_by_the_newer_setting_are_not_used_either():
-    matmul = torch.backends.cuda.matmul
-    before = matmul.fp32_precision
-    matmul.fp32_precision = "tf32"
-    try:
-        with device_search._full_float32():
-            assert matmul.fp32_precision == "ieee"
-        assert matmul.fp32_precision == "tf32"
-    finally:
-        matmul.fp32_precision = before
-
-
 def test_a_search_on_the_device_stays_there():
     points, sites = cloud(400, 6), cloud(100, 6, seed=1)
     with pretended_cuda() as traffic:

@@ -7,6 +7,7 @@ import torch
 
 import cvtgs
 from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.cvt import stratified_seeds
 from cvtgs.io import axes as axes_module
 from cvtgs.outofcore import simplify_file
 from cvtgs.rendering import contributions
@@ -24,12 +25,16 @@ IMAGES = {
 
 
 @contextmanager
-def another_dtype():
-    torch.set_default_dtype(torch.float64)
+def another_dtype(dtype=torch.float64):
+    torch.set_default_dtype(dtype)
     try:
         yield
     finally:
         torch.set_default_dtype(torch.float32)
+
+
+def short_dtype():
+    return another_dtype(torch.bfloat16)
 
 
 def another_device():
@@ -41,8 +46,27 @@ def autocast():
     return torch.autocast("cpu", dtype=torch.bfloat16)
 
 
+@contextmanager
+def coarse_products():
+    """Products of 8 bits, on CPUs that have them."""
+    torch.set_float32_matmul_precision("medium")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision("highest")
+
+
 settings = pytest.mark.parametrize(
-    "setting", [torch.no_grad, torch.inference_mode, autocast, another_dtype, another_device]
+    "setting",
+    [
+        torch.no_grad,
+        torch.inference_mode,
+        autocast,
+        coarse_products,
+        another_dtype,
+        short_dtype,
+        another_device,
+    ],
 )
 
 
@@ -143,6 +167,15 @@ def test_views(scene, setting, find):
 
 
 @settings
+def test_seeds(setting):
+    weights = torch.rand(2000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    wanted = stratified_seeds(weights, 600)
+    with setting():
+        found = stratified_seeds(weights, 600)
+    assert all(map(torch.equal, found, wanted))
+
+
+@settings
 def test_positions_above_a_floor(setting):
     scene = make("courtyard", 500, sh_degree=0, seed=1)
     wanted = find_view_positions(scene)
@@ -155,7 +188,7 @@ def test_positions_above_a_floor(setting):
 @backends
 @settings
 def test_contributions(scene, setting, backend):
-    cameras = automatic_views(scene, 2, width=32, height=32)
+    cameras = automatic_views(scene, 1, width=600, height=32)  # beyond 8 bits
     wanted = contributions(scene, cameras, backend=backend)
     with setting():
         again = scene.select(scene.means[:, 0] > -torch.inf)  # made with the setting

@@ -7,16 +7,14 @@ product. That is some 500 comparisons per point, whatever the number of sites, i
 
 import math
 from bisect import bisect_left
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from functools import partial
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.devices import chunk_length, row_chunks
+from cvtgs.devices import chunk_length, full_precision, row_chunks
 
 FAN_BITS = 3  # levels of the tree that are descended at once: a box has eight children
 FARTHEST = 1e37  # limit of coordinates in float32, in units
@@ -136,7 +134,7 @@ def nearest_in_tiles(
     leaves = split_sites(sites, max(LEAF, 4 * count))  # at least twice as many as wanted
     homes, order = torch.sort(home_leaves(points, leaves.splits), stable=True)
     boxes = boxes_of(leaves.sites)
-    with _full_float32():
+    with full_precision():
         for part in row_chunks(len(points), TILES * TILE, points.device):
             rows, own = order[part], homes[part]
             found[rows], squared[rows] = _nearest_of_part(points[rows], own, leaves, boxes, count)
@@ -312,23 +310,3 @@ def _fast_distances(
     norms = sites.square().sum(2).masked_fill_(none, torch.inf)
     # |s|^2 - 2 p s as one product of longer vectors: adding the norms would read all once more.
     return torch.bmm(factors, torch.cat([sites, norms[:, :, None]], dim=2).mT)
-
-
-@contextmanager
-def _full_float32() -> Iterator[None]:
-    """Multiply matrices in float32, even if the program allows fewer bits (TF32)."""
-    try:
-        before, choose = torch.get_float32_matmul_precision(), torch.set_float32_matmul_precision
-        full = "highest"
-    except RuntimeError:  # the program has set it by the names of torch 2.9 and newer
-        matmul = torch.backends.cuda.matmul
-        before, choose = matmul.fp32_precision, partial(setattr, matmul, "fp32_precision")
-        full = "ieee"
-    if before == full:
-        yield
-        return
-    choose(full)
-    try:
-        yield
-    finally:
-        choose(before)

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.devices import without_autocast
+from cvtgs.devices import full_precision
 from cvtgs.errors import (
     FileFormatError,
     InputNotFoundError,
@@ -105,7 +105,7 @@ class LpipsWeights:
 
 
 @torch.no_grad()
-@without_autocast()
+@full_precision()
 def lpips(
     a: Float[Tensor, "c h w 3"],
     b: Float[Tensor, "c h w 3"],

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.devices import without_autocast
+from cvtgs.devices import full_precision
 from cvtgs.losses import SSIM_WINDOW, check_pair, mean_ssim
 
 
@@ -33,7 +33,7 @@ def psnr(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tens
 
 
 @torch.no_grad()
-@without_autocast()
+@full_precision()
 def ssim(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tensor, "c"]:
     """Return the structural similarity of each pair of images.
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.devices import without_autocast
+from cvtgs.devices import full_precision
 from cvtgs.edit import turned_normals
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import multiply_quats
@@ -37,7 +37,7 @@ def checked_axes(name: str) -> str:
     return name.lower()
 
 
-@without_autocast()
+@full_precision()
 def change_axes(scene: GaussianScene, source: str, target: str) -> GaussianScene:
     """Convert a scene from one set of axes to another.
 

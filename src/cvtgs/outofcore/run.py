@@ -14,7 +14,7 @@ from cvtgs.checks import checked
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import checked_whole, shared_out, shortfall, target_count, whole_number
-from cvtgs.devices import HOST, on_host, one_thread, without_autocast
+from cvtgs.devices import HOST, full_precision, on_host, one_thread
 from cvtgs.edit import concatenate
 from cvtgs.errors import ConfigError, check_path, warn
 from cvtgs.evaluation.blind_views import check_seen
@@ -176,7 +176,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     )
     job = in_folder(job, output, simplifier.checkpoint, adapts=blocks is None)
     clock = StageClock(listener, HOST)
-    with output_lock(output), without_autocast():
+    with output_lock(output), full_precision():
         resumes = job.can_resume()
         with started(job, workers, clock, simplifier.checkpoint, resumes=resumes):
             if not resumes:

@@ -12,7 +12,7 @@ from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock, check_listener
 from cvtgs.config import RefineConfig
 from cvtgs.counts import checked_whole
-from cvtgs.devices import chosen_device, threads_for_chunks, within_memory, without_autocast
+from cvtgs.devices import chosen_device, full_precision, threads_for_chunks, within_memory
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError, memory_errors, warn
 from cvtgs.evaluation.blind_views import check_seen
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer
@@ -191,7 +191,7 @@ def _refine_on(  # noqa: PLR0913 (options by name)
     # The program may have disabled gradients, or be in inference mode or autocast.
     with (
         threads_for_chunks(),
-        without_autocast(),
+        full_precision(),
         torch.inference_mode(mode=False),
         torch.enable_grad(),
         clock.stage(STAGE, limits.total),

@@ -10,7 +10,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import check_listener
 from cvtgs.counts import whole_number
-from cvtgs.devices import without_autocast
+from cvtgs.devices import full_precision
 from cvtgs.errors import InvalidArgumentError, memory_errors
 from cvtgs.math import parameters
 from cvtgs.math.spherical_harmonics import SH_C0
@@ -55,7 +55,7 @@ class Rendering:
         return f"Rendering({size}, {self.backend}, {self.alpha.device})"
 
 
-@without_autocast()
+@full_precision()
 def render(
     scene: SceneLike,
     cameras: Cameras,
@@ -136,7 +136,7 @@ def render(
     return Rendering(rgb=rgb, alpha=output.alpha, depth=depths, backend=name)
 
 
-@without_autocast()
+@full_precision()
 def contributions(
     scene: GaussianScene, cameras: Cameras, *, backend: BackendName = "auto"
 ) -> Float[Tensor, "n"]:
@@ -224,7 +224,7 @@ def check_observed(views: object, name: str) -> None:
 
 
 @torch.no_grad()
-@without_autocast()
+@full_precision()
 def observe(
     scene: GaussianScene,
     cameras: Cameras,
@@ -278,7 +278,7 @@ def observe(
     )
 
 
-@without_autocast()
+@full_precision()
 def error_shares(
     scene: GaussianScene, views: ObservedViews, *, backend: BackendName = "auto"
 ) -> Float[Tensor, "n"]:
@@ -330,7 +330,7 @@ def error_shares(
     return total
 
 
-@without_autocast()
+@full_precision()
 def blending_weights(
     scene: GaussianScene, camera: Cameras, *, backend: BackendName = "auto"
 ) -> BlendingWeights:

@@ -178,8 +178,8 @@ def _strips(
     splat, place = _expand(torch.where(bottom >= top, last - first + 1, 0))
     row = first[splat] + place
     y = y[splat]
-    upper = torch.maximum(row * side, top[splat]) + 0.5 - y
-    lower = torch.minimum(row * side + side - 1, bottom[splat]) + 0.5 - y
+    upper = torch.maximum(row * side, top[splat]).to(y) + 0.5 - y
+    lower = torch.minimum(row * side + side - 1, bottom[splat]).to(y) + 0.5 - y
     left, right = _extent(splats.ellipses[splat], reach[splat], upper, lower)
     x = splats.centers[:, 0][splat]
     begin, end = _pixels(x + left, x + right, width)
@@ -314,7 +314,7 @@ def _composite_batch(
     valid = places < lists.starts[tiles + 1][:, None]
     entries = torch.where(valid, places, 0)
     params = packed[lists.splats[entries]]
-    pixels = torch.arange(lists.side, device=packed.device) + 0.5
+    pixels = torch.arange(lists.side, dtype=packed.dtype, device=packed.device) + 0.5
     columns = (tiles % lists.across * lists.side)[:, None] + pixels
     rows = (tiles // lists.across * lists.side)[:, None] + pixels
     x, y, square, shear, rest, log_opacity = (

@@ -19,7 +19,7 @@ from cvtgs.analysis.effects import restore_comments, select_columns
 from cvtgs.checks import checked
 from cvtgs.clock import StageClock
 from cvtgs.counts import checked_whole, shared_out, target_count, written_ratios
-from cvtgs.devices import HOST, on_host, one_thread, without_autocast
+from cvtgs.devices import HOST, full_precision, on_host, one_thread
 from cvtgs.errors import InvalidArgumentError, check_path
 from cvtgs.filters import filter_rows
 from cvtgs.grouping import allocate, finer_count, order_rows, tessellate_rows, weigh_rows
@@ -255,7 +255,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
     job = in_folder(job, folder, simplifier.checkpoint, adapts=blocks is None)
     check_stream(folder, kind, overwrite=overwrite)
     lock = output_lock(Path(job.folder).parent)  # commands lock the output folder
-    with lock, without_autocast():
+    with lock, full_precision():
         parts, resumed = _run(job, simplifier.checkpoint, workers, StageClock(listener, HOST))
         publish(form, parts, job.output, Path(folder), overwrite=overwrite)
         job.remove()

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from cvtgs.counts import whole_number
-from cvtgs.devices import in_float32, one_thread, without_autocast
+from cvtgs.devices import full_precision, in_float32, one_thread
 from cvtgs.errors import InvalidArgumentError, memory_errors
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
@@ -64,7 +64,7 @@ def scene(kind: str, count: int, *, sh_degree: int = 3, seed: int = 0) -> Gaussi
         in_float32(),
         one_thread(),  # chunks are too small for more
         torch.device("cpu"),
-        without_autocast(),
+        full_precision(),
     ):
         generator = torch.Generator().manual_seed(seed)
         parts = LAYOUTS[kind](Random(generator=generator, tile=noise_tile(generator)))

@@ -16,7 +16,7 @@ from torch import Tensor
 import cvtgs
 from cvtgs.checks import checked
 from cvtgs.clock import check_listener
-from cvtgs.devices import chosen_device, in_float32, on_host, thread_count, without_autocast
+from cvtgs.devices import chosen_device, full_precision, in_float32, on_host, thread_count
 from cvtgs.errors import (
     CheckpointError,
     ConfigError,
@@ -60,7 +60,7 @@ LARGEST_GRADIENT = 1.0  # gradients are clipped to this norm
 @on_host()
 @torch.inference_mode(mode=False)
 @torch.enable_grad()
-@without_autocast()
+@full_precision()
 @checked
 def train(
     config: TrainConfig,

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.devices import HOST, in_chunks, without_autocast
+from cvtgs.devices import HOST, full_precision, in_chunks
 from cvtgs.math import parameters
 from cvtgs.rendering import choose_backend, render
 from cvtgs.rendering.render import contributions_to_each
@@ -101,7 +101,7 @@ def splat_widths(scene: GaussianScene) -> Float[Tensor, "n"]:
     return scene.log_scales.double().sort(dim=1).values[:, 1:].mean(dim=1).exp()
 
 
-@without_autocast()
+@full_precision()
 def measure_splats(
     scene: GaussianScene, widths: Float[Tensor, "n"], radius: float, cameras: Cameras
 ) -> SplatSizes:

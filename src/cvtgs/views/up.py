@@ -132,7 +132,8 @@ def find_up(
     bare = usual.new_tensor([_lowest_level(voxels, up).bare for up in ups])
     scores = evidence.amax(dim=1) + bare
     if ground is not None:
-        scores += _PLANE_WEIGHT * ground.score * ((ups @ ground.normal).abs() > _SNAP_COSINE)
+        is_near = (ups @ ground.normal).abs() > _SNAP_COSINE
+        scores += _PLANE_WEIGHT * ground.score * is_near.to(scores)
     growth = (ups @ _growth(voxels)).clamp(-_MOST_GROWTH, _MOST_GROWTH)
     low = _skewness(voxels.points @ ups.T).clamp(-_MOST_SKEWNESS, _MOST_SKEWNESS)
     if not enclosed:
