@@ -2,6 +2,7 @@
 
 import os
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -17,6 +18,7 @@ from cvtgs.evaluation import EvaluationSettings
 from cvtgs.outofcore import LocalWorkers, images as module, simplify_file
 from cvtgs.outofcore.memory import IMAGE_BYTES, LEAST_BYTES
 from cvtgs.report import MatchReport, RefineReport
+from cvtgs.tags import TWO_SCALES
 from cvtgs.views import automatic_views, mixed_views
 
 COUNT, LARGER_COUNT = 200, 800
@@ -224,6 +226,18 @@ def test_images_raise_the_least_memory(source, tmp_path):
         InvalidArgumentError, match=rf"at least {least:,} \([\d.]+ MB\) with images"
     ):
         in_blocks(source, tmp_path / "no.ply", MATCHED, blocks=None, memory=least - 1)
+
+
+@pytest.mark.parametrize("boxes", [(), (Box(min=(-99, -99, 0.4), max=(99, 99, 99)),)])
+def test_blocks_of_flat_gaussians_that_become_thick_are_matched(scene, tmp_path, boxes):
+    """Their simplified Gaussians have three scales, the full ones two."""
+    flat = replace(scene, comments=(TWO_SCALES.text,))
+    cvtgs.save(flat, tmp_path / "in.ply")
+    small = tmp_path / "out.ply"
+    settings = MATCHED | {"effects": {"flat": "off"}}
+    in_blocks(tmp_path / "in.ply", small, settings, count=LARGER_COUNT, blocks=2, boxes=boxes)
+    assert len(cvtgs.load(small)) == LARGER_COUNT
+    assert not cvtgs.load(small).has_two_scales
 
 
 @pytest.mark.long

@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from statistics import mean
 from typing import Any, NamedTuple
@@ -42,6 +43,7 @@ from cvtgs.rendering import ObservedViews, contributions, error_shares, observe
 from cvtgs.rendering.projection import warn_of_near_plane
 from cvtgs.report import MatchReport, RefineReport
 from cvtgs.scene import GaussianScene
+from cvtgs.tags import TWO_SCALES
 from cvtgs.views import CameraPositions, find_view_positions, mixed_views
 
 MEASURED = "measured.json"  # file of the sums over all blocks
@@ -290,7 +292,9 @@ def _draw(job: Job, block: int, own: GaussianScene, found: BlockCells) -> Drawn:
 
     def bare(scene: GaussianScene) -> GaussianScene:
         used = drop_unused_bands(select_columns(scene, effects), plan)
-        return used.with_tensors({}, {})
+        # Only files tell flat Gaussians apart; simplified blocks are thick if the plan says so.
+        comments = TWO_SCALES.removed_from(used.comments)
+        return replace(used.with_tensors({}, {}), comments=comments, layout=())
 
     parts = [bare(job.source.scene(rows)) for rows in kept_rows(job)]
     parts += [
