@@ -18,7 +18,7 @@ from cvtgs.evaluation import EvaluationSettings
 from cvtgs.outofcore import LocalWorkers, images as module, simplify_file
 from cvtgs.outofcore.memory import IMAGE_BYTES, LEAST_BYTES
 from cvtgs.report import MatchReport, RefineReport
-from cvtgs.tags import TWO_SCALES
+from cvtgs.tags import ANTIALIASED, TWO_SCALES
 from cvtgs.views import automatic_views, mixed_views
 
 COUNT, LARGER_COUNT = 200, 800
@@ -226,6 +226,16 @@ def test_images_raise_the_least_memory(source, tmp_path):
         InvalidArgumentError, match=rf"at least {least:,} \([\d.]+ MB\) with images"
     ):
         in_blocks(source, tmp_path / "no.ply", MATCHED, blocks=None, memory=least - 1)
+
+
+def test_a_tag_that_is_switched_off_does_not_change_views(scene, tmp_path, monkeypatch):
+    cvtgs.save(replace(scene, comments=(ANTIALIASED.text,)), tmp_path / "in.ply")
+    looks, real = [], module.observe
+    monkeypatch.setattr(module, "observe", lambda s, views: looks.append(views) or real(s, views))
+    settings = MATCHED | {"effects": {"mip": "off"}}
+    in_blocks(tmp_path / "in.ply", tmp_path / "out.ply", settings, blocks=2)
+    wanted = mixed_views(scene, 12, size=64, seed=0)
+    assert all(torch.equal(views.viewmats, wanted.viewmats) for views in looks)
 
 
 @pytest.mark.parametrize("boxes", [(), (Box(min=(-99, -99, 0.4), max=(99, 99, 99)),)])

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from cvtgs import analysis, cvt, filters, validity
 from cvtgs.analysis.analyze import apparent_areas, frame_of, visibility_at
+from cvtgs.analysis.effects import drop_mip_tag
 from cvtgs.boxes import check_room, inside
 from cvtgs.clock import StageClock
 from cvtgs.config import TessellationConfig
@@ -112,8 +113,6 @@ def _scan(
         raise InvalidArgumentError(
             f"all {kept:,} valid Gaussians are protected, so there is nothing to simplify."
         )
-    if job.config.uses_images:
-        write_views(job, sample, total=valid)
     rest = min(job.target, valid) - kept
     scan = scan_scene(
         sample,
@@ -125,6 +124,8 @@ def _scan(
         config=job.config,
         frame=frame,
     )
+    if job.config.uses_images:
+        write_views(job, drop_mip_tag(sample, scan.plan), total=valid)
     return rest, scan
 
 
