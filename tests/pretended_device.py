@@ -48,6 +48,9 @@ MOST_EIGENPROBLEMS = 1000
 ANY_ORDER = {"cumsum", "cumprod", "logcumsumexp", "index_add", "scatter_add", "histc"}
 """Operations that add floats in arbitrary order on CUDA; ``check_order`` handles others."""
 
+UNSETTLED = {"kthvalue", "median"}
+"""Operations with indices of any equal value, refused by ``torch.use_deterministic_algorithms``."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Traffic:
@@ -189,6 +192,8 @@ def check_order(name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Non
         adds = floats and kind in ANY_ORDER
     if adds:
         raise RuntimeError(f"{kind}: CUDA adds in any order")
+    if kind in UNSETTLED and len(args) > 1:
+        raise RuntimeError(f"{kind} does not have a deterministic implementation")
 
 
 class Constructors(TorchFunctionMode):

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.devices import chunk_length, full_precision, row_chunks
+from cvtgs.math.segments import kth_smallest
 
 FAN_BITS = 3  # levels of the tree that are descended at once: a box has eight children
 FARTHEST = 1e37  # limit of coordinates in float32, in units
@@ -190,7 +191,7 @@ def tiles_of(
         own = homes[part]
         squared = (leaves.sites[own] - points[part, None]).square().sum(2)
         squared = squared.masked_fill(leaves.is_filling[own], torch.inf)
-        nearest = squared.amin(1) if count == 1 else squared.kthvalue(count, dim=1).values
+        nearest = squared.amin(1) if count == 1 else kth_smallest(squared, count)
         bounds[part] = nearest
     fill = torch.arange(-(-len(points) // size) * size, device=points.device)
     last = len(points) - 1  # the last tile is filled with its own points, backwards

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.devices import row_chunks
+from cvtgs.math.segments import kth_smallest
 
 RADIUS_QUANTILE = 0.7  # the share of points within the radius of a frame
 CHUNK = 1 << 16  # points per chunk, to bound memory
@@ -109,7 +110,8 @@ def group_radius(points: Float[Tensor, "n 3"]) -> float:
         return math.inf
     sample = points.index_select(0, rows).double()
     mode = "donot_use_mm_for_euclid_dist"  # products would lose digits far from the origin
-    near = torch.cdist(sample[::16], sample, compute_mode=mode).kthvalue(len(sample) // 20).values
+    distances = torch.cdist(sample[::16], sample, compute_mode=mode)
+    near = kth_smallest(distances, len(sample) // 20)
     return 7.0 * float(near.median()) or math.inf
 
 

@@ -28,11 +28,19 @@ def true_rows(mask: Bool[Tensor, "n"], count: int | None = None) -> Int[Tensor, 
     return torch.sort(~mask, stable=True).indices[:count]
 
 
+def kth_smallest(values: Float[Tensor, "*r n"], count: int) -> Float[Tensor, "*r"]:
+    """Return the ``count``-th smallest value along the last dimension."""
+    if values.device.type == "cpu":
+        return values.kthvalue(count).values
+    # CUDA's kthvalue fails where a program demands deterministic algorithms of torch.
+    return values.topk(count, largest=False).values[..., -1]
+
+
 def smallest_rows(values: Float[Tensor, "n"], count: int) -> Int[Tensor, "k"]:
     """Return rows of the smallest values, ascending and stable; a CPU sorts only those."""
     if 2 * count >= len(values) or values.device.type != "cpu":
         return ascending_rows(values)[:count]
-    most = torch.kthvalue(values, count).values
+    most = kth_smallest(values, count)
     candidates = (~(values > most)).nonzero()[:, 0]
     return candidates[ascending_rows(values[candidates])[:count]]
 

@@ -20,6 +20,7 @@ from cvtgs.losses import relative_loss
 from cvtgs.math import parameters
 from cvtgs.math.frames import robust_frame
 from cvtgs.math.parameters import divide
+from cvtgs.math.segments import kth_smallest
 from cvtgs.progress import ProgressEvent, ProgressListener
 from cvtgs.refinement.images import ImageBuffer
 from cvtgs.rendering import render
@@ -326,7 +327,7 @@ def _size_factors(scene: GaussianScene, movable: Bool[Tensor, "n"]) -> Float[Ten
     some = sizes[movable]
     if len(some) == 0:
         return torch.ones_like(sizes)
-    limit = math.log(LARGE) + some.kthvalue(-(-3 * len(some) // 4)).values
+    limit = math.log(LARGE) + kth_smallest(some, -(-3 * len(some) // 4))
     return (limit - sizes).clamp_max(0.0).exp()
 
 
