@@ -110,6 +110,16 @@ def test_the_shipped_rates_were_measured_on_the_trials_of_calibrations():
         assert ("refine" in found[trial.name]) == trial.config.uses_images
 
 
+def test_rates_of_a_preset_that_does_more_are_no_longer_those_of_its_trials(monkeypatch):
+    """Twice as many images in a step are no slower machine."""
+    before = [trial.name for trial in TRIALS]
+    more = SimplifyConfig.compose(preset="matched", settings={"refine.images_per_step": "4"})
+    changed = {"standard": preset("standard"), "matched": more}
+    monkeypatch.setattr(SimplifyConfig, "from_preset", changed.__getitem__)
+    same = [trial.name == name for trial, name in zip(TRIALS, before, strict=True)]
+    assert same == [trial.preset == "standard" for trial in TRIALS]
+
+
 def test_a_scene_that_stays_whole_is_only_checked_and_analysed():
     whole = Work(count=2_000_000, target=2_000_000, colors=48)
     assert set(shipped_model().stage_seconds(whole, preset("high"))) == {"check", "plan"}

@@ -41,7 +41,7 @@ MOST_START_SECONDS = 1.0  # for loading: what takes longer was compilation, once
 CANDIDATES = tuple(name for name in PRESETS if name != "paper")  # which is only for comparison
 RENDERERS = ("gsplat", "numba")  # not imported to check, as that can outlast a run
 
-VERSION: Literal[7] = 7  # of the cache file; raised when features change, to replace older files
+VERSION: Literal[8] = 8  # of the cache file; raised when features change, to replace older files
 SHIPPED_RATES = "rates.json"  # written by ``python -m benchmarks.cost_model --ship``
 STALE_SECONDS = 90 * 24 * 3600.0  # since drivers, limits and other loads change
 CPU_STEP = 1 / 64  # of a process's CPU seconds on Windows
@@ -64,11 +64,22 @@ class Trial:
     steps: int = 0
 
     @property
+    def work(self) -> Work:
+        """The size of the simplification."""
+        target = target_count(self.count, self.rho)
+        return Work(count=self.count, target=target, colors=3 * (self.sh_degree + 1) ** 2)
+
+    @property
     def name(self) -> str:
-        """A name of everything that is measured."""
+        """A name of everything that is measured, also of what follows from the preset."""
         scene = f"{self.kind} of {self.count:,}, SH degree {self.sh_degree}"
         images = f"{self.views} images of {self.size}, {self.steps} steps"
-        return f"{self.preset} at {self.rho}: {scene}; {images}"
+        amounts = [
+            f"{amount:.6g}"  # a logarithm has other last bits on other systems
+            for stage in FEATURES
+            for amount in self.work.features(stage, self.config).values()
+        ]
+        return f"{self.preset} at {self.rho}: {scene}; {images}; amounts {_digest(amounts)}"
 
     @property
     def config(self) -> SimplifyConfig:
@@ -104,7 +115,7 @@ _UNSAVED: dict[Path, "CachedModel"] = {}  # measurements that could not be writt
 class CachedModel(Record, allow_inf_nan=False):
     """The content of the cache file."""
 
-    version: Literal[7]
+    version: Literal[8]
     key: dict[str, str]
     made: float
     model: CostModel
@@ -264,10 +275,7 @@ def calibrate(
     """
     made = cache(make)
     scenes = [made(trial.kind, trial.count, sh_degree=trial.sh_degree) for trial in trials]
-    works = [
-        Work.of(scene, target_count(len(scene), trial.rho))
-        for trial, scene in zip(trials, scenes, strict=True)
-    ]
+    works = [trial.work for trial in trials]
     total, begun = MOST_REPEATS * len(trials), cpu()
 
     def measure(row: int, done: int, text: str) -> Mapping[str, float]:
