@@ -179,7 +179,7 @@ def stratified_seeds(
         is_other[rows] = False
         others = is_other.nonzero()[:, 0]
         total = running_sums(weights.index_select(0, others))
-        steps = torch.arange(free, dtype=torch.float64, device=weights.device)
+        steps = torch.arange(free, dtype=torch.float32, device=weights.device)
         middles = (steps + 0.5) * (total[-1] / free)
         picks = torch.searchsorted(total, middles).clamp_max(len(others) - 1)
         # Weights below one step give distinct picks, except for rounding and zero weights:
