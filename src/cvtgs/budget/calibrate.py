@@ -17,7 +17,7 @@ from typing import Literal
 import torch
 
 import cvtgs
-from cvtgs.budget.costs import FEATURES, CostModel, Measurement, Work
+from cvtgs.budget.costs import COLORS, FEATURES, CostModel, Measurement, Work
 from cvtgs.clock import StageCost, check_listener
 from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.config.base import Record
@@ -67,7 +67,7 @@ class Trial:
     def work(self) -> Work:
         """The size of the simplification."""
         target = target_count(self.count, self.rho)
-        return Work(count=self.count, target=target, colors=3 * (self.sh_degree + 1) ** 2)
+        return Work(count=self.count, target=target, colors=COLORS[self.sh_degree])
 
     @property
     def name(self) -> str:

@@ -239,10 +239,8 @@ def view_components(
     both = torch.cat([first, first + 1])
     bands = scene.shN.index_select(0, rows.index_select(0, both))
     bands, weights = move_together([bands, masses.index_select(0, both)], HOST)
-    colors, weights = (
-        view_colors(bands.double(), torch.eye(width, dtype=torch.float64, device=HOST)),
-        weights.double(),
-    )
+    colors = view_colors(bands.double(), torch.eye(width, dtype=torch.float64, device=HOST))
+    weights = weights.double()
     weights = divide(weights, weights.sum())
     centered = colors - weights @ colors
     variances, axes = torch.linalg.eigh(centered.T @ (centered * weights[:, None]))
