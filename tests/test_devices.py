@@ -1,6 +1,8 @@
 """Devices: choice, names, memory and threads."""
 
 import platform
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -205,6 +207,21 @@ def test_fewer_bits_of_matrix_products_are_not_used():
         with full_precision():
             assert torch.get_float32_matmul_precision() == "highest"
         assert torch.get_float32_matmul_precision() == "medium"
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def test_fewer_bits_are_not_used_while_any_thread_needs_them_all():
+    """The setting is that of the whole process; calls overlap, and the first one ends first."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        with ThreadPoolExecutor(1) as pool, ExitStack() as first, ExitStack() as second:
+            first.enter_context(full_precision())
+            pool.submit(second.enter_context, full_precision()).result()
+            first.close()
+            assert torch.get_float32_matmul_precision() == "highest"
+        assert torch.get_float32_matmul_precision() == "high"
     finally:
         torch.set_float32_matmul_precision(before)
 

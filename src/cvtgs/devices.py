@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, nullcontext
 from contextvars import ContextVar
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -44,13 +45,15 @@ class _Own(threading.local):
 
 
 class _Limits:
-    """Running calls that limit torch, in the whole process, and its threads before the first."""
+    """Running calls that limit torch, in the whole process, and its settings before the first."""
 
     lock = threading.Lock()
     setting = threading.Lock()
     dtype = threading.RLock()  # held while torch's default dtype is another
     running = 0
     threads = 1
+    exact = 0  # running calls of full_precision
+    restore_products: Callable[[], object]  # to call after the last of them
 
 
 _OWN = _Own()
@@ -279,18 +282,34 @@ def full_precision() -> Iterator[None]:
         for kind in ("cpu", "cuda"):
             if torch.is_autocast_enabled(kind):
                 stack.enter_context(torch.autocast(kind, enabled=False))
+        with _Limits.setting:
+            if _Limits.exact == 0:
+                _Limits.restore_products = _use_exact_products()
+            _Limits.exact += 1
         try:
-            before = torch.get_float32_matmul_precision()
-        except RuntimeError:  # the program has set it by the names of torch 2.9 and newer
-            for kind in ("cuda", "mkldnn"):
-                matmul = getattr(torch.backends, kind).matmul
-                stack.callback(setattr, matmul, "fp32_precision", matmul.fp32_precision)
-                matmul.fp32_precision = "ieee"
-        else:
-            if before != "highest":
-                stack.callback(torch.set_float32_matmul_precision, before)
-                torch.set_float32_matmul_precision("highest")
-        yield
+            yield
+        finally:
+            with _Limits.setting:
+                _Limits.exact -= 1
+                if _Limits.exact == 0:  # the setting is that of the whole process
+                    _Limits.restore_products()
+
+
+def _use_exact_products() -> Callable[[], object]:
+    """Multiply matrices in all bits of their dtype; return a function that takes this back."""
+    try:
+        before = torch.get_float32_matmul_precision()
+    except RuntimeError:  # the program has set it by the names of torch 2.9 and newer
+        stack = ExitStack()
+        for kind in ("cuda", "mkldnn"):
+            matmul = getattr(torch.backends, kind).matmul
+            stack.callback(setattr, matmul, "fp32_precision", matmul.fp32_precision)
+            matmul.fp32_precision = "ieee"
+        return stack.close
+    if before == "highest":
+        return lambda: None
+    torch.set_float32_matmul_precision("highest")
+    return partial(torch.set_float32_matmul_precision, before)
 
 
 @contextmanager
