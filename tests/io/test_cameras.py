@@ -143,7 +143,7 @@ def test_blender_scenes_have_one_file_per_split_and_png_sizes(tmp_path) -> None:
         load_cameras(tmp_path / "transforms_test.json", split="train")
     assert str(error.value) == (
         f"{tmp_path / 'transforms_test.json'}: the split of this file must be 'test', found "
-        f"'train'; give the folder."
+        f"'train'; give the folder to read both splits."
     )
 
 

@@ -170,7 +170,7 @@ BINARY: Mapping[str, tuple[str, bytes, str]] = {
     ),
     "endless name": (
         "images", packed_image(name=b"x" * 5000),
-        "the name of image 0 must end within 4,096 bytes, found none.",
+        "the name of image 0 must end within 4,096 bytes, found no end.",
     ),
     "no name": (
         "images", packed_image(name=b"\0"), "image 0: the image must have a name, found none.",

@@ -177,7 +177,8 @@ def test_missing_image_sizes_are_one_sentence(tmp_path) -> None:
     for content in (b"\xff\xd8\xff" + bytes(100), b"\x89PNG"):
         (tmp_path / "r_0.png").write_bytes(content)
         assert camera_refusal(path) == (
-            f"{tmp_path / 'r_0.png'}: must be a PNG unless 'w' and 'h' are given, found another."
+            f"{tmp_path / 'r_0.png'}: must be a PNG unless the camera file gives 'w' and 'h', "
+            "found another format; add them to it."
         )
 
 
@@ -223,11 +224,13 @@ JSON: Mapping[str, tuple[bytes, str]] = {
     ),
     "other object": (
         b'{"w": 3}',
-        "must be a list of cameras (INRIA's) or an object with 'frames', found neither.",
+        "must be a list of cameras (INRIA's cameras.json) or an object with 'frames' "
+        "(transforms.json), found neither.",
     ),
     "a number": (
         b"3",
-        "must be a list of cameras (INRIA's) or an object with 'frames', found neither.",
+        "must be a list of cameras (INRIA's cameras.json) or an object with 'frames' "
+        "(transforms.json), found neither.",
     ),
     "no camera": (b"[]", "must hold at least one camera, found none."),
 }

@@ -196,7 +196,22 @@ def test_a_checkpoint_that_is_cut_short_is_refused(tmp_path: Path, share: float)
     path.write_bytes(content[: int(share * len(content))])
     with pytest.raises(FileFormatError) as caught:
         load(path)
-    assert str(caught.value) == (f"{path}: must be a zip as torch.save writes, found another.")
+    assert str(caught.value) == (
+        f"{path}: must be a whole zip as torch.save writes, found another format or a part; if "
+        f"torch can load it, save it again."
+    )
+
+
+def test_a_damaged_zip_is_told_from_other_formats(tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    torch.save(to_dict(random_scene(5)), path)
+    path.write_bytes(path.read_bytes().replace(b"PK\1\2", b"PK\7\2", 1))
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    assert str(caught.value) == (
+        f"{path}: must be an intact checkpoint of tensors and plain numbers, found damage "
+        f"(BadZipFile)."
+    )
 
 
 def test_a_plain_pickle_is_refused(tmp_path: Path) -> None:

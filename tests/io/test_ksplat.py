@@ -105,14 +105,18 @@ def test_a_bound_of_0_stands_for_the_usual_one(
     [
         (1, struct.pack("<B", 2), "must be a .ksplat of version 0.1 with compression 0, 1 or 2"),
         (20, struct.pack("<H", 7), "must be a .ksplat of version 0.1 with compression 0, 1 or 2"),
-        (4, struct.pack("<I", 1 << 30), "must hold 1,073,741,824 sections"),
+        (
+            4,
+            struct.pack("<I", 1 << 30),
+            "must hold the headers of 1,073,741,824 sections, found 37,774 bytes.",
+        ),
         (
             16,
             struct.pack("<I", 701),
             "must hold the 701 Gaussians of the header",
         ),
-        (4096, struct.pack("<I", 1 << 30), "found 29,582 with room for 703 Gaussians."),
-        (4096 + 4, struct.pack("<I", 699), "found 29,582 with room for 699 Gaussians."),
+        (4096, struct.pack("<I", 1 << 30), "found 29,582 bytes and room for 703."),
+        (4096 + 4, struct.pack("<I", 699), "found 29,582 bytes and room for 699."),
         (4096 + 12, struct.pack("<I", 1 << 30), "a section of 700 Gaussians must take"),
         (4096 + 32, struct.pack("<I", 1), "buckets of a section must hold 700 Gaussians"),
         (4096 + 40, struct.pack("<H", 3), "must have an SH degree of at most 2, found 3"),

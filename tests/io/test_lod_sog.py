@@ -133,7 +133,9 @@ def test_lod_is_refused_for_other_files_and_out_of_range(stream: Path, tmp_path:
     save(storable_scene(3), tmp_path / "a.ply")
     assert len(load(tmp_path / "a.ply", lod=0)) == 3
     for other in (1, "0"):
-        with pytest.raises(InvalidArgumentError, match=r"0 unless for a streamed SOG, found"):
+        with pytest.raises(
+            InvalidArgumentError, match=r"0 unless for a streamed SOG \(lod-meta.json\), found"
+        ):
             load(tmp_path / "a.ply", lod=cast("Any", other))
     wrongs: tuple[Any, ...] = (-1, 2, 0.5, "1", True)
     for lod in wrongs:

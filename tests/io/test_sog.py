@@ -244,7 +244,7 @@ def test_a_missing_first_code_is_extrapolated(tmp_path: Path) -> None:
 
 DAMAGED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "version": (lambda m: m.update(version=3), "'version' must be 1 or 2, found 3."),
-    "count": (lambda m: m.update(count=0), "'count' must be 1 to 268,402,689, found 0."),
+    "count": (lambda m: m.update(count=0), "must state 1 to 268,402,689 Gaussians, found 0."),
     "lying count": (
         lambda m: m.update(count=200_000),
         "must have 200,000 pixels, found",

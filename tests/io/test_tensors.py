@@ -104,7 +104,7 @@ def test_damaged_bytes_are_refused(tmp_path, damage):
     path.write_bytes(content)
     with pytest.raises(FileFormatError) as caught:
         map_tensors(path)
-    assert str(caught.value) == f"{path}: must be an intact safetensors file, found none."
+    assert str(caught.value) == f"{path}: must be an intact safetensors file, found damage."
 
 
 def test_a_missing_file_is_refused(tmp_path):

@@ -222,5 +222,6 @@ def _file_views(path: Path, split: Split | None) -> list[View]:
     if isinstance(content, dict) and "frames" in content:
         return transforms_views(content, path, split)
     raise FileFormatError(
-        f"{path}: must be a list of cameras (INRIA's) or an object with 'frames', found neither."
+        f"{path}: must be a list of cameras (INRIA's cameras.json) or an object with 'frames' "
+        f"(transforms.json), found neither."
     )

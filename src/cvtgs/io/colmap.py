@@ -149,7 +149,8 @@ class _Bytes:
         text, zero, _ = self.file.read(_MAX_NAME + 1).partition(b"\0")
         if not zero:
             raise FileFormatError(
-                f"{self.path}: the name of {what} must end within {_MAX_NAME:,} bytes, found none."
+                f"{self.path}: the name of {what} must end within {_MAX_NAME:,} bytes, "
+                f"found no end."
             )
         self.file.seek(start + len(text) + 1)
         return _text_of(text)

@@ -265,7 +265,8 @@ def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
             raise
         kind = type(error).__name__
         raise FileFormatError(
-            f"{path}: must be an intact checkpoint, found damage ({kind})."
+            f"{path}: must be an intact checkpoint of tensors and plain numbers, found damage "
+            f"({kind})."
         ) from error
     if splatfacto and scene.sh_degree == 0:
         colors = torch.sigmoid(scene.sh0)  # through which it trains them at this degree
@@ -307,7 +308,10 @@ def _unpickled(path: Path) -> Any:
     """Load a checkpoint by memory mapping, so that only tensors that are copied are read."""
     with open_input(path) as file:
         if not zipfile.is_zipfile(file):
-            raise FileFormatError(f"{path}: must be a zip as torch.save writes, found another.")
+            raise FileFormatError(
+                f"{path}: must be a whole zip as torch.save writes, found another format or a "
+                f"part; if torch can load it, save it again."
+            )
     names = set[str]()
     for name in _names_in(path):
         if not _ALLOWED.fullmatch(name):

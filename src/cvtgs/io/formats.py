@@ -149,7 +149,8 @@ def load(
         options = {name: given[name] for name in signature(read).parameters if name in given}
         if lod not in (None, 0) and "lod" not in options:
             raise InvalidArgumentError(
-                f"lod must be 0 unless for a streamed SOG, found {lod!r} for {source}."
+                f"lod must be 0 unless for a streamed SOG (lod-meta.json), found {lod!r} for "
+                f"{source}."
             )
         scene = read(source, **options)
         if axes is not None and "axes" not in options:
@@ -326,7 +327,9 @@ def _suffix_of(
             return suffix
     *others, last = known
     if format is not None:
-        raise FileFormatError(f"format must be {', '.join(others)} or {last}, found {format!r}.")
+        raise FileFormatError(
+            f"format must be {', '.join(others)} or {last}, found {shown(format)}."
+        )
     found = f"the suffix {path.suffix!r}" if path.suffix else "no suffix"
     if path.suffix.lower() == ".pth":
         found += "; of a model of INRIA's code, give its folder or its point_cloud.ply"

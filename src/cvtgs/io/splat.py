@@ -116,7 +116,9 @@ def read_ksplat(path: Path) -> GaussianScene:
                 f"version {major}.{minor} and compression {level}."
             )
         if _HEADER_BYTES + most * _SECTION.size > size:
-            raise FileFormatError(f"{path}: must hold {most:,} sections, found {size:,} bytes.")
+            raise FileFormatError(
+                f"{path}: must hold the headers of {most:,} sections, found {size:,} bytes."
+            )
         headers = file.read(most * _SECTION.size)
         sections = [_Section(*fields) for fields in _SECTION.iter_unpack(headers)]
         sh_range = (low or _SH_RANGE[0], high or _SH_RANGE[1])
@@ -158,8 +160,8 @@ def _read_section(
     needed = section.extra_bytes + row.itemsize * section.used
     if section.used > section.room or needed > left:
         raise FileFormatError(
-            f"{path}: a section of {section.used:,} Gaussians must take {needed:,} bytes, found "
-            f"{left:,} with room for {section.room:,} Gaussians."
+            f"{path}: a section of {section.used:,} Gaussians must take {needed:,} bytes and have "
+            f"room for all, found {left:,} bytes and room for {section.room:,}."
         )
     lengths = np.fromfile(file, "<u4", section.partial_buckets).astype(np.int64)
     extra = np.fromfile(file, np.uint8, section.bucket_bytes * section.buckets)

@@ -151,7 +151,7 @@ def peek_spz(content: bytes, path: Path | str) -> SpzHeader:
     if len(start) < _HEADER.size or not start.startswith(_MAGIC):
         raise FileFormatError(
             f"{path}: an .spz file must start with a header of {_HEADER.size} bytes that begin "
-            f"with {_MAGIC!r}, found {len(start)} that begin with {start[:4]!r}."
+            f"with {_MAGIC!r}, in gzip or not, found {len(start)} that begin with {start[:4]!r}."
         )
     header = SpzHeader(*_HEADER.unpack(start)[1:])
     if header.version not in ((1, 2, 3) if is_packed else (4,)):

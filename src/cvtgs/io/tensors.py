@@ -62,7 +62,9 @@ def map_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[s
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             return tensors, dict(file.metadata() or {})
     except (SafetensorError, OSError) as error:
-        raise FileFormatError(f"{path}: must be an intact safetensors file, found none.") from error
+        raise FileFormatError(
+            f"{path}: must be an intact safetensors file, found damage."
+        ) from error
 
 
 def tensors_digest(tensors: Mapping[str, Tensor], text: str) -> str:

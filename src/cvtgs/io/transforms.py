@@ -117,7 +117,8 @@ def transforms_views(content: Any, path: Path, split: Split | None) -> list[View
     if own in SPLITS:
         if own != split:
             raise InvalidArgumentError(
-                f"{path}: the split of this file must be {own!r}, found {split!r}; give the folder."
+                f"{path}: the split of this file must be {own!r}, found {split!r}; give the folder "
+                f"to read both splits."
             )
         return views
     lists = (document.train_filenames, document.val_filenames, document.test_filenames)
@@ -196,7 +197,8 @@ def _size(frame: _Frame, *, path: Path, where: str) -> tuple[int, int]:
             if signature == _PNG_SIGNATURE and chunk == b"IHDR":
                 return width, height
         raise FileFormatError(
-            f"{candidate}: must be a PNG unless 'w' and 'h' are given, found another."
+            f"{candidate}: must be a PNG unless the camera file gives 'w' and 'h', found another "
+            f"format; add them to it."
         )
     raise FileFormatError(
         f"{where}: 'w' and 'h' must be given in the frame or at the top level of the file, or the "

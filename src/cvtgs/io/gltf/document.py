@@ -261,7 +261,8 @@ def _chunks(content: bytes, path: Path) -> tuple[bytes, bytes | None]:
         at += CHUNK.size
         if at + size > length:
             raise FileFormatError(
-                f"{path}: chunks must end within {length:,} bytes, found one until {at + size:,}."
+                f"{path}: chunks must end within {length:,} bytes, found one that ends at byte "
+                f"{at + size:,}."
             )
         found.setdefault(kind, content[at : at + size])
         at += size

@@ -204,7 +204,9 @@ def _read_meta(content: Any, where: str) -> _Meta:
     is_first = (validated(_Root, content, where).version or 1) == 1
     meta = (_meta_of_version_1 if is_first else _meta_of_version_2)(content, where)
     if not 0 < meta.count <= _MOST_COUNT:
-        raise FileFormatError(f"{where}: 'count' must be 1 to {_MOST_COUNT:,}, found {meta.count}.")
+        raise FileFormatError(
+            f"{where}: must state 1 to {_MOST_COUNT:,} Gaussians, found {meta.count:,}."
+        )
     return meta
 
 
