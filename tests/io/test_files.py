@@ -98,7 +98,7 @@ def test_an_unknown_suffix_is_refused(tmp_path: Path, name: str, found: str) -> 
     with pytest.raises(FileFormatError) as caught:
         load(path)
     assert str(caught.value) == (
-        f"{path}: must end in .compressed.ply, .ply, .spz, .ksplat, .splat, .sog, "
+        f"{path}: the name must end in .compressed.ply, .ply, .spz, .ksplat, .splat, .sog, "
         f"lod-meta.json, meta.json, .glb, .gltf, .ckpt or .pt, found {found}."
     )
 

@@ -288,6 +288,6 @@ def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError) as caught:
         save(make_scene(), tmp_path / "s.ckpt")
     assert str(caught.value) == (
-        f"{tmp_path}/s.ckpt: must end in .compressed.ply, .ply, .spz, .splat, .sog, "
+        f"{tmp_path}/s.ckpt: the name must end in .compressed.ply, .ply, .spz, .splat, .sog, "
         f".spz.glb, .glb, .gltf or .usda, found the suffix '.ckpt'."
     )

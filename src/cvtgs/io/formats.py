@@ -333,4 +333,6 @@ def _suffix_of(
     found = f"the suffix {path.suffix!r}" if path.suffix else "no suffix"
     if path.suffix.lower() == ".pth":
         found += "; of a model of INRIA's code, give its folder or its point_cloud.ply"
-    raise FileFormatError(f"{path}: must end in {', '.join(others)} or {last}, found {found}.")
+    raise FileFormatError(
+        f"{path}: the name must end in {', '.join(others)} or {last}, found {found}."
+    )
