@@ -18,7 +18,7 @@ from cvtgs.errors import (
     MissingDependencyError,
 )
 from cvtgs.io import load
-from cvtgs.io.ply import read
+from cvtgs.io.ply import header
 from cvtgs.io.ply.header import MAX_HEADER_BYTES
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
 
@@ -313,13 +313,13 @@ def test_a_file_that_becomes_shorter_while_it_is_read_is_named(
 ) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(GOOD)
-    check = read.check_size
+    check = header.check_size
 
     def check_and_cut(*arguments: object, **options: object) -> None:
         check(*arguments, **options)  # type: ignore[arg-type]
         os.truncate(path, len(GOOD) // 2)
 
-    monkeypatch.setattr(read, "check_size", check_and_cut)
+    monkeypatch.setattr(header, "check_size", check_and_cut)
     with pytest.raises(InputError, match="must stay as it is while it is read, found it shorter"):
         load(path)
 

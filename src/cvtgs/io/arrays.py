@@ -1,7 +1,7 @@
 """Scenes as numpy arrays, and the conversions of parameters that compact formats share."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,8 +23,7 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 HALF_RANGE = np.float32(np.sqrt(0.5))  # bounds the three smaller components of a unit quaternion
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Arrays:
+class Arrays(NamedTuple):
     """The standard tensors of a scene, float32, on the CPU."""
 
     means: Float[np.ndarray, "n 3"]
@@ -33,9 +32,6 @@ class Arrays:
     logit_opacities: Float[np.ndarray, "n"]
     sh0: Float[np.ndarray, "n 3"]
     shN: Float[np.ndarray, "n k 3"]  # noqa: N815 (the name that scenes give it)
-
-
-ARRAY_NAMES = tuple(field.name for field in fields(Arrays))
 
 
 def arrays_of(scene: GaussianScene, *, sh_degree: int = 3) -> Arrays:
@@ -58,10 +54,10 @@ def arrays_of(scene: GaussianScene, *, sh_degree: int = 3) -> Arrays:
 
 def scene_of(arrays: Arrays, *, comments: Sequence[str] = ()) -> GaussianScene:
     """Build a scene."""
-    tensors = {}
-    for name in ARRAY_NAMES:
-        values = np.require(getattr(arrays, name), np.float32, ["C", "W"])
-        tensors[name] = torch.from_numpy(values)
+    tensors = {
+        name: torch.from_numpy(np.require(values, np.float32, ["C", "W"]))
+        for name, values in arrays._asdict().items()
+    }
     tensors["sh0"] = tensors["sh0"][:, None, :]
     return GaussianScene(**tensors, extras={}, comments=tuple(comments), layout=())
 

@@ -1,6 +1,5 @@
 """PlayCanvas' compressed PLY files: 16 bytes per Gaussian and one per view-dependent SH value."""
 
-import os
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -65,9 +64,7 @@ def read_compressed_ply(path: Path) -> GaussianScene:
     with open_input(path) as file:
         header = read_header(file, str(path))
         _check(header, path)
-        check_size(
-            header, header.elements[-1], path=str(path), size=os.fstat(file.fileno()).st_size
-        )
+        check_size(file, header, header.elements[-1], str(path))
         file.seek(header.data_offset)
         tables = {
             table.name: np.fromfile(file, row_dtype(table.columns), table.count)

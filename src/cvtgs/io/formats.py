@@ -43,8 +43,8 @@ _READERS: Mapping[str, str] = {
     ".sog": "cvtgs.io.sog:read_sog",
     "lod-meta.json": "cvtgs.io.sog:read_lod_sog",
     "meta.json": "cvtgs.io.sog:read_sog",
-    ".glb": "cvtgs.io.gltf:read_gltf",
-    ".gltf": "cvtgs.io.gltf:read_gltf",
+    ".glb": "cvtgs.io.gltf.read:read_gltf",
+    ".gltf": "cvtgs.io.gltf.read:read_gltf",
     ".ckpt": "cvtgs.io.dicts:read_checkpoint",
     ".pt": "cvtgs.io.dicts:read_checkpoint",
 }
@@ -54,9 +54,9 @@ _WRITERS: Mapping[str, str] = {
     ".spz": "cvtgs.io.spz:write_spz",
     ".splat": "cvtgs.io.splat:write_splat",
     ".sog": "cvtgs.io.sog:write_sog",
-    ".spz.glb": "cvtgs.io.gltf:write_spz_glb",
-    ".glb": "cvtgs.io.gltf:write_glb",
-    ".gltf": "cvtgs.io.gltf:write_gltf",
+    ".spz.glb": "cvtgs.io.gltf.write:write_spz_glb",
+    ".glb": "cvtgs.io.gltf.write:write_glb",
+    ".gltf": "cvtgs.io.gltf.write:write_gltf",
     ".usda": "cvtgs.io.usd:write_usda",
 }
 _FILE_AXES = {".spz.glb": "luf", ".glb": "luf", ".gltf": "luf", ".usda": "rub"}  # of formats

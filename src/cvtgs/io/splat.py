@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 
 from cvtgs.errors import FileFormatError
 from cvtgs.io.arrays import (
-    ARRAY_NAMES,
     Arrays,
     arrays_of,
     colors_of_sh0,
@@ -135,9 +134,7 @@ def read_ksplat(path: Path) -> GaussianScene:
         raise FileFormatError(
             f"{path}: must hold the {count:,} Gaussians of the header, at least 1, found {found:,}."
         )
-    names = ARRAY_NAMES
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return scene_of(Arrays(**joined))
+    return scene_of(Arrays(*map(np.concatenate, zip(*parts, strict=True))))
 
 
 def _row_type(level: int, degree: int, path: Path) -> np.dtype[Any]:

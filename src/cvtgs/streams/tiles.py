@@ -21,8 +21,8 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.io import atomic_output
 from cvtgs.io.axes import SCENE_AXES, change_axes
 from cvtgs.io.formats import tagged_if_flat
-from cvtgs.io.gltf import write_spz_glb
 from cvtgs.io.gltf.document import AXES, SPLATS, SPZ
+from cvtgs.io.gltf.write import write_spz_glb
 from cvtgs.io.limits import FORMAT_LIMITS, clamped_within, dropped_within
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import rms_error

@@ -27,24 +27,8 @@ from cvtgs.io.files import (
     check_expansion,
     validated,
 )
-from cvtgs.io.gltf.document import (
-    AXES,
-    COLOR_SPACE,
-    KERNEL,
-    OPACITY,
-    POSITION,
-    QUANTIZATION,
-    ROTATION,
-    SCALE,
-    SPLATS,
-    SPZ,
-    Accessor,
-    Entry,
-    GltfFile,
-    Indices,
-    coefficients,
-    open_gltf,
-)
+from cvtgs.io.gltf import document as gltf
+from cvtgs.io.gltf.document import GltfFile
 from cvtgs.io.spz import decode_spz, peek_spz
 from cvtgs.math.parameters import matrices_to_quats, quats_to_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS
@@ -52,7 +36,7 @@ from cvtgs.scene import GaussianScene
 from cvtgs.tags import ANTIALIASED
 from cvtgs.text import counted, printable, shown
 
-_KNOWN = (SPLATS, SPZ, QUANTIZATION)
+_KNOWN = (gltf.SPLATS, gltf.SPZ, gltf.QUANTIZATION)
 # A file may show this many primitives, and one more for so many bytes, fewer than a node takes.
 _MOST_PLACED, _NODE_BYTES = 1000, 40
 _EVENNESS = 1e-4  # tolerance for the scale of a node to count as uniform, relative to it
@@ -61,12 +45,12 @@ Matrix = Float[np.ndarray, "4 4"]
 
 
 class _Scene(Document):
-    nodes: Indices
+    nodes: gltf.Indices
 
 
 class _Node(Document):
     mesh: Size | None = None
-    children: Indices
+    children: gltf.Indices
     matrix: Annotated[list[Number], Field(min_length=16, max_length=16)] | None = Field(
         None, description="16 finite numbers"
     )
@@ -84,15 +68,15 @@ class _Primitive(Document):
         dict[str, Size],
         Field(default_factory=dict, description="a JSON object with numbers of accessors"),
     ]
-    extensions: Entry
+    extensions: gltf.Entry
     mode: Whole = 4
     extras: Any = None
 
 
 class _Splatting(Document):
-    kernel: Text = KERNEL
-    colorSpace: Text = COLOR_SPACE  # noqa: N815 (the name of glTF)
-    extensions: Entry
+    kernel: Text = gltf.KERNEL
+    colorSpace: Text = gltf.COLOR_SPACE  # noqa: N815 (the name of glTF)
+    extensions: gltf.Entry
 
 
 class _Compression(Document):
@@ -109,13 +93,13 @@ class _Splats(NamedTuple):
 
 def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False) -> GaussianScene:
     """Read the Gaussians of a ``.glb`` or ``.gltf``."""
-    file = open_gltf(path)
+    file = gltf.open_gltf(path)
     strange = [name for name in file.root.extensionsRequired if name not in _KNOWN]
     if strange:
         raise file.error(f"must require only {', '.join(_KNOWN)}, found {shown(strange[0])}")
     placed = _splats(file, math.inf if trust_sizes else file.stored // _NODE_BYTES + _MOST_PLACED)
     if not placed:
-        raise file.error(f"must have a mesh primitive with {SPLATS}, found none")
+        raise file.error(f"must have a mesh primitive with {gltf.SPLATS}, found none")
     splats = {one.where: one for one, _ in placed}  # each once, though nodes may repeat its mesh
     if not trust_sizes:
         _check_sizes(file, splats, [one.where for one, _ in placed])
@@ -125,7 +109,7 @@ def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False)
     for one, matrix in placed:
         scenes.append(_moved(file, read[one.where], matrix))
     scene = concatenate(scenes, fill=True)
-    return change_axes(scene, AXES if axes is None else axes, SCENE_AXES)
+    return change_axes(scene, gltf.AXES if axes is None else axes, SCENE_AXES)
 
 
 def _splats(file: GltfFile, most: float) -> list[tuple[_Splats, Matrix]]:
@@ -152,8 +136,9 @@ def _splats_of(file: GltfFile, index: int, primitives: list[Any]) -> Iterator[_S
     for number, value in enumerate(primitives):
         where = f"{file.path}: meshes[{index}].primitives[{number}]"
         primitive = validated(_Primitive, value, where)
-        if SPLATS in primitive.extensions:
-            splatting = validated(_Splatting, primitive.extensions[SPLATS], f"{where}: {SPLATS!r}")
+        if gltf.SPLATS in primitive.extensions:
+            found = primitive.extensions[gltf.SPLATS]
+            splatting = validated(_Splatting, found, f"{where}: {gltf.SPLATS!r}")
             yield _Splats(primitive, splatting, where)
 
 
@@ -200,7 +185,7 @@ def _check_sizes(file: GltfFile, splats: dict[str, _Splats], placed: list[str]) 
             counts[where] = header.count
             degrees.append(header.sh_degree)
             continue
-        position = file.entry(Accessor, "accessors", _index(file, one, POSITION))
+        position = file.entry(gltf.Accessor, "accessors", _index(file, one, gltf.POSITION))
         if position.bufferView is not None:
             file.view(position.bufferView)  # so that the bytes of a file beside it count
         counts[where] = position.count
@@ -211,9 +196,9 @@ def _check_sizes(file: GltfFile, splats: dict[str, _Splats], placed: list[str]) 
 
 def _packed(file: GltfFile, one: _Splats) -> tuple[bytes, str] | None:
     """Return the SPZ inside a primitive, and its name for errors; None if it has attributes."""
-    if SPZ not in one.splatting.extensions:
+    if gltf.SPZ not in one.splatting.extensions:
         return None
-    value, where = one.splatting.extensions[SPZ], f"{one.where}: {SPZ!r}"
+    value, where = one.splatting.extensions[gltf.SPZ], f"{one.where}: {gltf.SPZ!r}"
     index = validated(_Compression, value, where).bufferView
     content, _ = file.view(index)
     return bytes(content), f"{file.path}: bufferViews[{index}]"
@@ -221,14 +206,14 @@ def _packed(file: GltfFile, one: _Splats) -> tuple[bytes, str] | None:
 
 def _read_primitive(file: GltfFile, one: _Splats, *, trust_sizes: bool) -> GaussianScene:
     primitive, splatting = one.primitive, one.splatting
-    if primitive.mode != 0 or splatting.kernel != KERNEL:
+    if primitive.mode != 0 or splatting.kernel != gltf.KERNEL:
         raise file.error(
-            f"Gaussians must be points (mode 0) with the kernel {KERNEL!r}, found mode "
+            f"Gaussians must be points (mode 0) with the kernel {gltf.KERNEL!r}, found mode "
             f"{primitive.mode} and {shown(splatting.kernel)}"
         )
-    if splatting.colorSpace != COLOR_SPACE:
+    if splatting.colorSpace != gltf.COLOR_SPACE:
         found = f"{file.path}: read colours of the colour space {shown(splatting.colorSpace)}"
-        warn(f"{found} as {COLOR_SPACE!r}.", DroppedDataWarning)
+        warn(f"{found} as {gltf.COLOR_SPACE!r}.", DroppedDataWarning)
     packed = _packed(file, one)
     if packed is None:
         scene = _read_attributes(file, one)
@@ -245,36 +230,37 @@ def _read_primitive(file: GltfFile, one: _Splats, *, trust_sizes: bool) -> Gauss
 
 
 def _read_attributes(file: GltfFile, one: _Splats) -> GaussianScene:
-    means = file.values(_index(file, one, POSITION), "VEC3", POSITION)
+    means = file.values(_index(file, one, gltf.POSITION), "VEC3", gltf.POSITION)
 
     def rows(name: str, kind: str) -> Float[np.ndarray, "n k"]:
         values = file.values(_index(file, one, name), kind, name)
         if len(values) != len(means):
             raise file.error(
-                f"{name} must have {len(means):,} elements like {POSITION}, found {len(values):,}"
+                f"{name} must have {len(means):,} elements like {gltf.POSITION}, found "
+                f"{len(values):,}"
             )
         return values
 
-    quats = rows(ROTATION, "VEC4")
-    scales = rows(SCALE, "VEC3")
+    quats = rows(gltf.ROTATION, "VEC4")
+    scales = rows(gltf.SCALE, "VEC3")
     if bool((scales < 0).any()):
         row = int((scales < 0).any(axis=1).argmax())
         raise file.error(
-            f"{SCALE} must not be negative, found {scales[row].min():.4g} in element {row:,} "
+            f"{gltf.SCALE} must not be negative, found {scales[row].min():.4g} in element {row:,} "
             f"(a draft of the extension, which splat-transform 2.3 wrote, stored logarithms)"
         )
-    opacities = rows(OPACITY, "SCALAR")[:, 0]
-    if any(name in one.primitive.attributes for name in coefficients(len(REST_COUNTS))):
+    opacities = rows(gltf.OPACITY, "SCALAR")[:, 0]
+    if any(name in one.primitive.attributes for name in gltf.coefficients(len(REST_COUNTS))):
         warn(f"{file.path}: left out SH coefficients above degree 3.", DroppedDataWarning)
     bands = range(1, 1 + _degree(file, one))
-    rest = [rows(name, "VEC3") for band in bands for name in coefficients(band)]
+    rest = [rows(name, "VEC3") for band in bands for name in gltf.coefficients(band)]
     return scene_of(
         Arrays(
             means=means,
             quats=unit_quats(np.roll(quats, 1, axis=1)),
             log_scales=log_scales_of(scales),
             logit_opacities=logits_of(opacities),
-            sh0=rows(coefficients(0)[0], "VEC3"),
+            sh0=rows(gltf.coefficients(0)[0], "VEC3"),
             shN=np.stack(rest, axis=1) if rest else np.empty((len(means), 0, 3), np.float32),
         )
     )
@@ -291,12 +277,12 @@ def _degree(file: GltfFile, one: _Splats) -> int:
     names = one.primitive.attributes
     degree = 0
     for band in range(1, len(REST_COUNTS)):
-        wanted = coefficients(band)
+        wanted = gltf.coefficients(band)
         missing = [name for name in wanted if name not in names]
         if len(missing) == len(wanted):
             continue
         if missing or degree != band - 1:
-            lacking = missing[0] if missing else coefficients(band - 1)[0]
+            lacking = missing[0] if missing else gltf.coefficients(band - 1)[0]
             raise file.error(f"Gaussians must have all SH up to degree {band}, found no {lacking}")
         degree = band
     return degree

@@ -20,28 +20,7 @@ from cvtgs.io.arrays import (
     scales_of,
     to_bytes,
 )
-from cvtgs.io.gltf.document import (
-    BINARY_CHUNK,
-    CHUNK,
-    COLOR,
-    COLOR_SPACE,
-    COMPONENTS,
-    FLOAT,
-    HEADER,
-    JSON_CHUNK,
-    KERNEL,
-    MAGIC,
-    OPACITY,
-    POSITION,
-    ROTATION,
-    SCALE,
-    SPLATS,
-    SPZ,
-    UNSIGNED_BYTE,
-    VERSION,
-    WIDTHS,
-    coefficients,
-)
+from cvtgs.io.gltf import document as gltf
 from cvtgs.io.spz import write_spz
 from cvtgs.math.spherical_harmonics import degree_of
 from cvtgs.scene import GaussianScene
@@ -62,16 +41,16 @@ class _Attribute(NamedTuple):
 
     @property
     def component(self) -> int:
-        return UNSIGNED_BYTE if self.name == COLOR else FLOAT
+        return gltf.UNSIGNED_BYTE if self.name == gltf.COLOR else gltf.FLOAT
 
     @property
     def row_bytes(self) -> int:
-        return WIDTHS[self.kind] * COMPONENTS[self.component].itemsize
+        return gltf.WIDTHS[self.kind] * gltf.COMPONENTS[self.component].itemsize
 
     def parts(self, count: int) -> Iterator[bytes]:
         for start in range(0, count, _CHUNK_ROWS):
             values = self.values(slice(start, min(start + _CHUNK_ROWS, count)))
-            yield np.ascontiguousarray(values, COMPONENTS[self.component]).tobytes()
+            yield np.ascontiguousarray(values, gltf.COMPONENTS[self.component]).tobytes()
 
 
 def write_glb(scene: GaussianScene, file: BinaryIO) -> None:
@@ -112,7 +91,7 @@ def write_spz_glb(scene: GaussianScene, file: BinaryIO) -> None:
     write_spz(scene, packed, version=_SPZ_VERSION)
     content = packed.getvalue()
     # Keep those that the draft of the extension lists; COLOR_0 has colours and opacities.
-    left_out = (OPACITY, *coefficients(0))
+    left_out = (gltf.OPACITY, *gltf.coefficients(0))
     attributes = [one for one in _attributes(arrays) if one.name not in left_out]
     document = _document(scene, arrays, attributes, compressed=len(content))
     write_chunks(file, document, len(content), [content])
@@ -127,14 +106,14 @@ def _attributes(arrays: Arrays) -> list[_Attribute]:
         return lambda part: arrays.shN[part, number]
 
     bands = range(1, 1 + degree_of(arrays.shN.shape[1]))
-    names = [name for band in bands for name in coefficients(band)]
+    names = [name for band in bands for name in gltf.coefficients(band)]
     return [
-        _Attribute(POSITION, "VEC3", lambda part: arrays.means[part]),
-        _Attribute(COLOR, "VEC4", colors),
-        _Attribute(ROTATION, "VEC4", lambda part: np.roll(arrays.quats[part], -1, axis=1)),
-        _Attribute(SCALE, "VEC3", lambda part: scales_of(arrays.log_scales[part])),
-        _Attribute(OPACITY, "SCALAR", lambda part: opacities_of(arrays.logit_opacities[part])),
-        _Attribute(coefficients(0)[0], "VEC3", lambda part: arrays.sh0[part]),
+        _Attribute(gltf.POSITION, "VEC3", lambda part: arrays.means[part]),
+        _Attribute(gltf.COLOR, "VEC4", colors),
+        _Attribute(gltf.ROTATION, "VEC4", lambda part: np.roll(arrays.quats[part], -1, axis=1)),
+        _Attribute(gltf.SCALE, "VEC3", lambda part: scales_of(arrays.log_scales[part])),
+        _Attribute(gltf.OPACITY, "SCALAR", lambda part: opacities_of(arrays.logit_opacities[part])),
+        _Attribute(gltf.coefficients(0)[0], "VEC3", lambda part: arrays.sh0[part]),
         *(_Attribute(name, "VEC3", rest(number)) for number, name in enumerate(names)),
     ]
 
@@ -151,9 +130,9 @@ def _document(
     accessors, offset, count = [], 0, len(arrays.means)
     for number, one in enumerate(attributes):
         accessor = {"componentType": one.component, "count": count, "type": one.kind}
-        if one.component == UNSIGNED_BYTE:
+        if one.component == gltf.UNSIGNED_BYTE:
             accessor["normalized"] = True
-        if one.name == POSITION:
+        if one.name == gltf.POSITION:
             accessor["min"] = arrays.means.min(axis=0).tolist()
             accessor["max"] = arrays.means.max(axis=0).tolist()
         if compressed is None:
@@ -163,16 +142,16 @@ def _document(
             views.append(view)
             offset += size
         accessors.append(accessor)
-    splatting: dict[str, Any] = {"kernel": KERNEL, "colorSpace": COLOR_SPACE}
-    used = [SPLATS]
+    splatting: dict[str, Any] = {"kernel": gltf.KERNEL, "colorSpace": gltf.COLOR_SPACE}
+    used = [gltf.SPLATS]
     if compressed is not None:
         views = [{"buffer": 0, "byteOffset": 0, "byteLength": compressed}]
-        splatting["extensions"] = {SPZ: {"bufferView": 0}}
-        used.append(SPZ)
+        splatting["extensions"] = {gltf.SPZ: {"bufferView": 0}}
+        used.append(gltf.SPZ)
     primitive: dict[str, Any] = {
         "mode": 0,
         "attributes": {one.name: number for number, one in enumerate(attributes)},
-        "extensions": {SPLATS: splatting},
+        "extensions": {gltf.SPLATS: splatting},
     }
     if scene.comments:
         lines = [line for comment in scene.comments for line in comment.splitlines()]
@@ -203,14 +182,14 @@ def write_chunks(
     text = json_bytes({**document, "buffers": [{"byteLength": size}]})
     text += b" " * (-len(text) % 4)
     padded = size + -size % 4
-    length = HEADER.size + 2 * CHUNK.size + len(text) + padded
+    length = gltf.HEADER.size + 2 * gltf.CHUNK.size + len(text) + padded
     if length >= _MOST_BYTES:
         raise InvalidSceneError(
             f"a .glb must be below 4 GiB, found {length:,} bytes; write .spz.glb, or simplify."
         )
-    file.write(HEADER.pack(MAGIC, VERSION, length))
-    file.write(CHUNK.pack(len(text), JSON_CHUNK) + text)
-    file.write(CHUNK.pack(padded, BINARY_CHUNK))
+    file.write(gltf.HEADER.pack(gltf.MAGIC, gltf.VERSION, length))
+    file.write(gltf.CHUNK.pack(len(text), gltf.JSON_CHUNK) + text)
+    file.write(gltf.CHUNK.pack(padded, gltf.BINARY_CHUNK))
     for part in parts:
         file.write(part)
     file.write(bytes(padded - size))

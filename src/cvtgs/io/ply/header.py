@@ -1,5 +1,6 @@
 """The header of a PLY file, and the only mapping from PLY names to tensors of a scene."""
 
+import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -299,10 +300,10 @@ def find_vertices(header: Header, path: str) -> Element:
     return vertex
 
 
-def check_size(header: Header, table: Element, *, path: str, size: int) -> None:
+def check_size(file: BinaryIO, header: Header, table: Element, path: str) -> None:
     """Check that a file is long enough for an element, before memory is allocated for its rows."""
     before = header.elements[: header.elements.index(table)]
-    room = size - header.data_offset
+    room = os.fstat(file.fileno()).st_size - header.data_offset
     room -= sum(element.count * element.row_bytes(header.encoding) for element in before)
     if header.encoding == "ascii":
         room += 1  # the last line may lack its newline

@@ -3,7 +3,7 @@
 import io
 import os
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,21 +26,7 @@ from cvtgs.errors import (
 )
 from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
 from cvtgs.io.files import check_degree, open_input
-from cvtgs.io.ply.header import (
-    SCALARS,
-    Element,
-    Header,
-    Layout,
-    check_size,
-    dtype_of,
-    find_vertices,
-    is_standard,
-    layout_of,
-    read_header,
-    rest_count_of,
-    row_dtype,
-    standard_slots,
-)
+from cvtgs.io.ply import header as ply
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import FLAT_LOG_SCALE, NORMALS, GaussianScene
 from cvtgs.text import first_of, shown
@@ -57,9 +43,9 @@ def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -
     """
     where = str(path)
     with open_input(path) as file:
-        header = read_header(file, where)
-        vertex = find_vertices(header, where)
-        check_size(header, vertex, path=where, size=os.fstat(file.fileno()).st_size)
+        header = ply.read_header(file, where)
+        vertex = ply.find_vertices(header, where)
+        ply.check_size(file, header, vertex, where)
         if can_map(header):
             chunks = _mapped_chunks(file, header, where)
         else:
@@ -69,7 +55,7 @@ def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -
         scene = assemble(
             chunks,
             count=vertex.count,
-            layout=layout_of(vertex),
+            layout=ply.layout_of(vertex),
             comments=header.comments,
             sh_degree=sh_degree,
             with_extras=extras,
@@ -93,18 +79,18 @@ def assemble(
     chunks: Iterable[NDArray[Any]],
     *,
     count: int,
-    layout: Layout,
+    layout: ply.Layout,
     comments: tuple[str, ...],
     sh_degree: int | None = None,
     with_extras: bool = True,
 ) -> GaussianScene:
     """Copy rows into a new scene, chunk by chunk; memory is the scene plus that of chunks."""
     types = dict(layout)
-    tensors = _empty_tensors(count, rest_count_of(types), dtype_of(layout))
+    tensors = _empty_tensors(count, ply.rest_count_of(types), ply.dtype_of(layout))
     extras = {
-        name: torch.empty(count, dtype=SCALARS[kind].dtype, device="cpu")
+        name: torch.empty(count, dtype=ply.SCALARS[kind].dtype, device="cpu")
         for name, kind in layout
-        if with_extras and not is_standard(name) and name not in NORMALS
+        if with_extras and not ply.is_standard(name) and name not in NORMALS
     }
     if sh_degree is not None and REST_COUNTS[sh_degree] < tensors["shN"].shape[1]:
         # numpy's zeros take no memory until they are written to; torch's do.
@@ -120,7 +106,8 @@ def assemble(
         stop = start + len(rows)
         if any(rows[name].any() for name in skipped):
             for name in skipped:
-                extras[name] = torch.zeros(count, dtype=SCALARS[types[name]].dtype, device="cpu")
+                dtype = ply.SCALARS[types[name]].dtype
+                extras[name] = torch.zeros(count, dtype=dtype, device="cpu")
                 columns[name] = extras[name].numpy()
             skipped = []
         with np.errstate(over="ignore", invalid="ignore"):
@@ -151,7 +138,7 @@ def _standard_columns(
     tensors: dict[str, Tensor], types: dict[str, str], sh_degree: int | None
 ) -> dict[str, NDArray[Any]]:
     """Return writable views of the standard columns to read, in file order."""
-    slots = standard_slots(tensors["shN"].shape[1])
+    slots = ply.standard_slots(tensors["shN"].shape[1])
     read = REST_COUNTS[-1 if sh_degree is None else sh_degree]
     return {
         name: tensors[tensor].numpy()[column]
@@ -160,17 +147,17 @@ def _standard_columns(
     }
 
 
-def can_map(header: Header) -> bool:
+def can_map(header: ply.Header) -> bool:
     """Return whether the vertex rows can be memory-mapped without conversion."""
     first = header.elements[0]
     little = header.encoding == "binary_little_endian"
     return little and first.name == "vertex" and not first.has_lists
 
 
-def _mapped_chunks(file: BinaryIO, header: Header, path: str) -> Iterator[NDArray[Any]]:
+def _mapped_chunks(file: BinaryIO, header: ply.Header, path: str) -> Iterator[NDArray[Any]]:
     """Map the vertex rows, a megabyte at a time, which is unmapped once the caller releases it."""
     vertex = header.elements[0]
-    dtype = row_dtype(vertex.columns)
+    dtype = ply.row_dtype(vertex.columns)
     rows = max(1, CHUNK_BYTES // dtype.itemsize)
     for start in range(0, vertex.count, rows):
         offset = header.data_offset + start * dtype.itemsize
@@ -188,7 +175,9 @@ def _mapped(
         raise InputError(f"{path}: must stay as it is while it is read, found {found}.") from error
 
 
-def _parsed_rows(file: BinaryIO, header: Header, vertex: Element, path: str) -> NDArray[Any]:
+def _parsed_rows(
+    file: BinaryIO, header: ply.Header, vertex: ply.Element, path: str
+) -> NDArray[Any]:
     """Read the vertex rows of any PLY file; ASCII rows and rows with lists are held in memory."""
     try:
         from plyfile import PlyData, PlyElementParseError, PlyParseError  # noqa: PLC0415
@@ -218,7 +207,7 @@ def _parsed_rows(file: BinaryIO, header: Header, vertex: Element, path: str) -> 
     return rows
 
 
-def _plain_header(header: Header, elements: tuple[Element, ...]) -> bytes:
+def _plain_header(header: ply.Header, elements: Sequence[ply.Element]) -> bytes:
     """Return a header for plyfile: no blanks or comments, and plain names e0, p0, ..."""
     lines = ["ply", f"format {header.encoding} 1.0"]
     for i, element in enumerate(elements):
@@ -234,7 +223,7 @@ def _plain_header(header: Header, elements: tuple[Element, ...]) -> bytes:
 class _CleanStream(io.BufferedReader):
     """A PLY file with a replaced header; positions are those of the original file."""
 
-    def __init__(self, file: BinaryIO, header: Header, elements: tuple[Element, ...]) -> None:
+    def __init__(self, file: BinaryIO, header: ply.Header, elements: Sequence[ply.Element]) -> None:
         super().__init__(io.FileIO(file.fileno(), closefd=False))
         self._pending = io.BytesIO(_plain_header(header, elements))
         self._is_text = header.encoding == "ascii"
@@ -254,7 +243,7 @@ class _CleanStream(io.BufferedReader):
         return self.read(size)
 
 
-def _explain(error: Any, elements: tuple[Element, ...], path: str) -> str:
+def _explain(error: Any, elements: Sequence[ply.Element], path: str) -> str:
     """Convert plyfile's error to one sentence with the names in the file."""
     element = elements[int(error.element.name[1:])]
     place = f"{path}: row {error.row} of {shown(element.name)}"
@@ -279,7 +268,7 @@ class PlyRows:
     path: str
     count: int
     dtype: np.dtype[Any]  # of a row
-    layout: Layout  # names and PLY types of the columns, as a scene keeps them
+    layout: ply.Layout  # names and PLY types of the columns, as a scene keeps them
     comments: tuple[str, ...]
     offset: int  # where the first row starts, in bytes
     sh_degree: int | None = None  # SH bands above it are left out of scenes; None keeps all
@@ -329,17 +318,16 @@ def open_rows(
         if file.read(3) != b"ply":
             raise refusal
         file.seek(0)
-        header = read_header(file, name)
-        size = os.fstat(file.fileno()).st_size
-    vertex = find_vertices(header, name)
-    check_size(header, vertex, path=name, size=size)
+        header = ply.read_header(file, name)
+        vertex = ply.find_vertices(header, name)
+        ply.check_size(file, header, vertex, name)
     if not can_map(header):
         raise refusal
     return PlyRows(
         path=str(Path(name).absolute()),  # for workers in other folders
         count=vertex.count,
-        dtype=row_dtype(vertex.columns),
-        layout=layout_of(vertex),
+        dtype=ply.row_dtype(vertex.columns),
+        layout=ply.layout_of(vertex),
         comments=header.comments,
         offset=header.data_offset,
         sh_degree=None if sh_degree is None else whole_number(sh_degree),

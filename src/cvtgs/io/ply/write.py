@@ -12,24 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.errors import FileFormatError, InvalidSceneError
-from cvtgs.io.ply.header import (
-    FLOAT_TYPES,
-    MAX_NAME_LETTERS,
-    SCALARS,
-    Layout,
-    dtype_of,
-    header_bytes,
-    is_name,
-    is_standard,
-    row_dtype,
-    standard_slots,
-)
+from cvtgs.io.ply import header as ply
 from cvtgs.io.ply.read import open_rows
 from cvtgs.scene import FLAT_LOG_SCALE, NORMALS, GaussianScene
 from cvtgs.text import counted, shown
 
 CHUNK_BYTES = 1 << 20  # bytes that are gathered before they are written
-_NATURAL_TYPES = {kind.dtype: name for name, kind in SCALARS.items()}
+_NATURAL_TYPES = {kind.dtype: name for name, kind in ply.SCALARS.items()}
 _NATURAL_TYPES |= {torch.bool: "uchar", torch.float16: "float", torch.bfloat16: "float"}
 
 
@@ -38,8 +27,8 @@ def write_ply(scene: GaussianScene, file: BinaryIO) -> None:
     if len(scene) == 0:
         raise InvalidSceneError("a scene must hold at least one Gaussian to be written, found 0.")
     layout = _output_layout(scene)
-    file.write(header_bytes(scene.comments, [("vertex", len(scene), layout)]))
-    dtype, slots = row_dtype(layout), standard_slots(scene.shN.shape[1])
+    file.write(ply.header_bytes(scene.comments, [("vertex", len(scene), layout)]))
+    dtype, slots = ply.row_dtype(layout), ply.standard_slots(scene.shN.shape[1])
     rows = max(1, CHUNK_BYTES // dtype.itemsize)
     for start in range(0, len(scene), rows):
         stop = min(start + rows, len(scene))
@@ -62,7 +51,7 @@ def join_plys(paths: Sequence[str | os.PathLike[str]], file: BinaryIO) -> None:
     for part in parts:
         if part.dtype != first.dtype:
             raise FileFormatError(f"{part.path}: must have the same columns as {first.path}.")
-    file.write(header_bytes(first.comments, [("vertex", total, first.layout)]))
+    file.write(ply.header_bytes(first.comments, [("vertex", total, first.layout)]))
     for part in parts:
         with Path(part.path).open("rb") as content:
             content.seek(part.offset)
@@ -85,23 +74,23 @@ def lost_scales(scene: GaussianScene) -> str:
     )
 
 
-def _output_layout(scene: GaussianScene) -> Layout:
+def _output_layout(scene: GaussianScene) -> ply.Layout:
     """Return the properties to write: those of the source where they fit, or INRIA's.
 
     Standard ones follow the scene (SH degree, dtype), and new extras are appended.
     """
     _check_names(scene)
-    slots = standard_slots(scene.shN.shape[1])
+    slots = ply.standard_slots(scene.shN.shape[1])
     float_type = "double" if scene.dtype == torch.float64 else "float"
     x, y, z, *others = slots
     base = dict(scene.layout) or dict.fromkeys([x, y, z, *NORMALS, *others], float_type)
     if "scale_2" not in base:
         del slots["scale_2"]
-    keeps_types = dtype_of(tuple(base.items())) == scene.dtype
+    keeps_types = ply.dtype_of(tuple(base.items())) == scene.dtype
     kept: list[tuple[str, str]] = []
     for name, kind in base.items():
         if name in slots:
-            usable = keeps_types and kind in FLOAT_TYPES
+            usable = keeps_types and kind in ply.FLOAT_TYPES
             kept.append((name, kind if usable else float_type))
         elif name in scene.extras:
             kept.append((name, _extra_type(name, scene.extras[name], kind)))
@@ -121,25 +110,25 @@ def _output_layout(scene: GaussianScene) -> Layout:
 
 def _check_names(scene: GaussianScene) -> None:
     for name in scene.extras:
-        if is_standard(name):
+        if ply.is_standard(name):
             raise InvalidSceneError(
                 f"extra column {name!r} must not be named like a property of the scene itself."
             )
-        if name.split() != [name] or not is_name(name):
+        if name.split() != [name] or not ply.is_name(name):
             raise InvalidSceneError(
-                f"column {shown(name)} must have a name of at most {MAX_NAME_LETTERS} letters "
+                f"column {shown(name)} must have a name of at most {ply.MAX_NAME_LETTERS} letters "
                 f"without blanks."
             )
     for name, kind in scene.layout:
-        if kind not in SCALARS:
+        if kind not in ply.SCALARS:
             raise InvalidSceneError(
-                f"the layout must give {name!r} a type of {', '.join(SCALARS)}, found {kind!r}."
+                f"the layout must give {name!r} a type of {', '.join(ply.SCALARS)}, found {kind!r}."
             )
 
 
 def _extra_type(name: str, column: Tensor, kind: str | None) -> str:
     """Return the type in the source file if it holds every value, else the column's own."""
-    if kind is not None and SCALARS[kind].dtype == column.dtype and _fits(column, kind):
+    if kind is not None and ply.SCALARS[kind].dtype == column.dtype and _fits(column, kind):
         return kind
     if column.dtype == torch.int64:
         for wide in ("uint", "int"):
@@ -157,7 +146,7 @@ def _extra_type(name: str, column: Tensor, kind: str | None) -> str:
 
 def _fits(column: Tensor, kind: str) -> bool:
     """Check the range where the torch dtype is wider than the PLY type."""
-    if kind in FLOAT_TYPES:
+    if kind in ply.FLOAT_TYPES:
         return True
-    limits = np.iinfo(SCALARS[kind].code)
+    limits = np.iinfo(ply.SCALARS[kind].code)
     return bool(((column >= limits.min) & (column <= limits.max)).all())

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -92,6 +92,15 @@ class _Palette(_TwoImages):
     codebook: _Codes
 
 
+class _Tables(NamedTuple):
+    """The value of each byte of a channel."""
+
+    scales: Float[np.ndarray, "3 256"]
+    colors: Float[np.ndarray, "3 256"]
+    opacities: Float[np.ndarray, "256"] | None = None  # of logits; None where bytes are opacities
+    rest: Float[np.ndarray, "256"] | None = None
+
+
 class _Version2(_Root):
     """Bytes index a codebook of at most 256 numbers, shared by all channels."""
 
@@ -101,6 +110,18 @@ class _Version2(_Root):
     quats: _OneImage
     sh0: _Codebook
     shN: _Palette | None = None  # noqa: N815 (the name in the file)
+
+    def tables(self) -> _Tables:
+        scales, colors = (_table(part.codebook) for part in (self.scales, self.sh0))
+        rest = None if self.shN is None else _table(self.shN.codebook)
+        return _Tables(np.tile(scales, (3, 1)), np.tile(colors, (3, 1)), rest=rest)
+
+
+def _table(codes: list[float | None]) -> Float[np.ndarray, "256"]:
+    values = np.array(codes, np.float64)
+    if codes[0] is None:  # some writers left it out; PlayCanvas' engine extrapolates it
+        values[0] = values[1] + (values[1] - values[-1]) / 255
+    return np.pad(values, (0, 256 - len(values)), "edge").astype(np.float32)
 
 
 class _ShapedMeans(_Means):
@@ -133,17 +154,19 @@ class _Version1(_Root):
     sh0: _FourRanges
     shN: _PaletteRange | None = None  # noqa: N815 (the name in the file)
 
+    @property
+    def count(self) -> int:
+        return self.means.shape[0]
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Meta:
-    """A checked ``meta.json``; tables give the value of each byte of a channel."""
+    def tables(self) -> _Tables:
+        scales, sh0 = (_steps(part.mins, part.maxs) for part in (self.scales, self.sh0))
+        rest = None if self.shN is None else _steps([self.shN.mins], [self.shN.maxs])[0]
+        return _Tables(scales, sh0[:3], sh0[3], rest)
 
-    document: _Version1 | _Version2
-    count: int
-    scales: Float[np.ndarray, "3 256"]
-    colors: Float[np.ndarray, "3 256"]
-    opacities: Float[np.ndarray, "256"] | None = None  # of logits; None where bytes are opacities
-    palette: Float[np.ndarray, "256"] | None = None
+
+def _steps(mins: Sequence[float], maxs: Sequence[float]) -> Float[np.ndarray, "k 256"]:
+    low, high = np.array(mins)[:, None], np.array(maxs)[:, None]
+    return np.asarray(low + (high - low) * (np.arange(256) / 255), np.float32)
 
 
 def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
@@ -166,43 +189,35 @@ def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
     # A damaged file may hold numbers beyond float32.
     with _opened(path, is_index=is_index) as read, np.errstate(all="ignore"):
         meta = _read_meta(parse_json(read(META, _MOST_META_BYTES), where), where)
-        document = meta.document
         if not trust_sizes:
             _check_expansion(meta, path, is_index=is_index)
-        images = _Images(read=read, count=meta.count, path=path)
-        means = _means(images, document.means)
-        quats = _quats(images.rows(document.quats.files[0]))
-        log_scales = _decoded(meta.scales, images.rows(document.scales.files[0]))
-        colors = images.rows(document.sh0.files[0])
+        tables, images = meta.tables(), _Images(read=read, count=meta.count, path=path)
+        means = _means(images, meta.means)
+        quats = _quats(images.rows(meta.quats.files[0]))
+        log_scales = _decoded(tables.scales, images.rows(meta.scales.files[0]))
+        colors = images.rows(meta.sh0.files[0])
+        opacities = colors[:, 3]
         arrays = Arrays(
             means=means,
             quats=quats,
             log_scales=log_scales,
-            logit_opacities=logits_of_bytes(colors[:, 3])
-            if meta.opacities is None
-            else meta.opacities.astype(np.float32)[colors[:, 3]],
-            sh0=_decoded(meta.colors, colors),
-            shN=_rest(images, meta),
+            logit_opacities=logits_of_bytes(opacities)
+            if tables.opacities is None
+            else tables.opacities[opacities],
+            sh0=_decoded(tables.colors, colors),
+            shN=_rest(images, meta.shN, tables.rest),
         )
-    is_smooth = document.model == "antialiased" or document.antialias is True
+    is_smooth = meta.model == "antialiased" or meta.antialias is True
     comments = [ANTIALIASED.text] if is_smooth else []
-    comments += [TWO_SCALES.text] if document.model == "2dgs" else []
+    comments += [TWO_SCALES.text] if meta.model == "2dgs" else []
     return scene_of(arrays, comments=comments)
 
 
-def _check_expansion(meta: _Meta, path: Path, *, is_index: bool) -> None:
-    document, rest = meta.document, meta.document.shN
-    parts = (document.means, document.scales, document.quats, document.sh0, rest)
-    names = {name for part in parts if part is not None for name in part.files}
-    degree = 0 if rest is None else rest.bands if isinstance(rest, _Palette) else 3
-    files = [path.parent / name for name in names] if is_index else [path]
-    stored = sum(file.stat().st_size for file in files if is_file(file))
-    check_expansion(path, count=meta.count, sh_degree=degree, stored=stored)
-
-
-def _read_meta(content: Any, where: str) -> _Meta:
+def _read_meta(content: Any, where: str) -> _Version1 | _Version2:
     is_first = (validated(_Root, content, where).version or 1) == 1
-    meta = (_meta_of_version_1 if is_first else _meta_of_version_2)(content, where)
+    meta = (
+        validated(_Version1, content, where) if is_first else validated(_Version2, content, where)
+    )
     if not 0 < meta.count <= _MOST_COUNT:
         raise FileFormatError(
             f"{where}: must state 1 to {_MOST_COUNT:,} Gaussians, found {meta.count:,}."
@@ -210,40 +225,14 @@ def _read_meta(content: Any, where: str) -> _Meta:
     return meta
 
 
-def _meta_of_version_1(content: Any, where: str) -> _Meta:
-    document = validated(_Version1, content, where)
-
-    def tables(mins: Sequence[float], maxs: Sequence[float]) -> Float[np.ndarray, "k 256"]:
-        low, high = np.array(mins)[:, None], np.array(maxs)[:, None]
-        return np.asarray(low + (high - low) * (np.arange(256) / 255))
-
-    sh0, rest = tables(document.sh0.mins, document.sh0.maxs), document.shN
-    return _Meta(
-        document=document,
-        count=document.means.shape[0],
-        scales=tables(document.scales.mins, document.scales.maxs),
-        colors=sh0[:3],
-        opacities=sh0[3],
-        palette=None if rest is None else tables([rest.mins], [rest.maxs])[0],
-    )
-
-
-def _meta_of_version_2(content: Any, where: str) -> _Meta:
-    document = validated(_Version2, content, where)
-
-    def table(codes: list[float | None]) -> Float[np.ndarray, "256"]:
-        values = np.array(codes, np.float64)
-        if codes[0] is None:  # some writers left it out; PlayCanvas' engine extrapolates it
-            values[0] = values[1] + (values[1] - values[-1]) / 255
-        return np.pad(values, (0, 256 - len(values)), "edge")
-
-    return _Meta(
-        document=document,
-        count=document.count,
-        scales=np.tile(table(document.scales.codebook), (3, 1)),
-        colors=np.tile(table(document.sh0.codebook), (3, 1)),
-        palette=None if document.shN is None else table(document.shN.codebook),
-    )
+def _check_expansion(meta: _Version1 | _Version2, path: Path, *, is_index: bool) -> None:
+    rest = meta.shN
+    parts = (meta.means, meta.scales, meta.quats, meta.sh0, rest)
+    names = {name for part in parts if part is not None for name in part.files}
+    degree = 0 if rest is None else rest.bands if isinstance(rest, _Palette) else 3
+    files = [path.parent / name for name in names] if is_index else [path]
+    stored = sum(file.stat().st_size for file in files if is_file(file))
+    check_expansion(path, count=meta.count, sh_degree=degree, stored=stored)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -294,14 +283,15 @@ def _quats(stored: UInt8[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
 def _decoded(
     table: Float[np.ndarray, "3 256"], stored: UInt8[np.ndarray, "n 4"]
 ) -> Float[np.ndarray, "n 3"]:
-    return np.asarray(table.astype(np.float32)[np.arange(3), stored[:, :3]])
+    return np.asarray(table[np.arange(3), stored[:, :3]])
 
 
-def _rest(images: _Images, meta: _Meta) -> Float[np.ndarray, "n k 3"]:
-    """Look labels up in the palette, and its bytes in the codebook; unknown labels give 0."""
-    part = meta.document.shN
-    if part is None or meta.palette is None:
-        return np.empty((meta.count, 0, 3), np.float32)
+def _rest(
+    images: _Images, part: _Palette | _PaletteRange | None, table: Float[np.ndarray, "256"] | None
+) -> Float[np.ndarray, "n k 3"]:
+    """Look labels up in the palette, and its bytes in the table; unknown labels give 0."""
+    if part is None or table is None:
+        return np.empty((images.count, 0, 3), np.float32)
     centroids, labels = part.files
     stored = images.rows(labels)[:, :2].astype(np.uint16)
     numbers = stored[:, 0] | stored[:, 1] << np.uint16(8)
@@ -313,7 +303,7 @@ def _rest(images: _Images, meta: _Meta) -> Float[np.ndarray, "n k 3"]:
         raise FileFormatError(
             f"{images.path}: {centroids} must be {wanted} pixels wide, found {pixels.shape[1]}."
         )
-    entries = meta.palette.astype(np.float32)[pixels[:, :, :3]].reshape(-1, k, 3)
+    entries = table[pixels[:, :, :3]].reshape(-1, k, 3)
     count = min(part.count, len(entries)) if isinstance(part, _Palette) else len(entries)
     known = numbers < count
     rest: Float[np.ndarray, "n k 3"] = entries[np.where(known, numbers, 0)]
