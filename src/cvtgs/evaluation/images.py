@@ -32,41 +32,20 @@ ERROR_SCALE = 0.3  # difference from which on the brightest colour is used
 _PIXEL_ASPECT = 0.02  # difference of the focal lengths of a camera that may be its own
 
 # Ten steps of "magma" (van der Walt and Smith 2015, CC0), which is perceptually uniform.
-_MAGMA = (
-    (0, 0, 4),
-    (24, 15, 62),
-    (69, 16, 119),
-    (114, 31, 129),
-    (159, 47, 127),
-    (205, 64, 113),
-    (241, 96, 93),
-    (253, 149, 103),
-    (254, 201, 141),
-    (252, 253, 191),
-)
+_MAGMA = bytes.fromhex("000004 180f3e 451077 721f81 9f2f7f cd4071 f1605d fd9567 fec98d fcfdbf")
 
 ALPHA_SCALE = 0.2  # absolute difference of alpha from which on the brightest colours are used
 
 # Warm where more of the background shows through, black where equal, cold where less shows.
-_ALPHA = (
-    (255, 246, 205),
-    (250, 178, 66),
-    (190, 82, 22),
-    (92, 33, 12),
-    (0, 0, 4),
-    (14, 38, 92),
-    (28, 84, 172),
-    (78, 165, 240),
-    (214, 240, 255),
-)
-
+_ALPHA = bytes.fromhex("fff6cd fab242 be5216 5c210c 000004 0e265c 1c54ac 4ea5f0 d6f0ff")
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _OTHER_SUFFIXES = (".avif", ".dng", ".exr", ".gif", ".heic", ".heif")  # of cameras' originals
 
 
-def _css_gradient(colors: tuple[tuple[int, int, int], ...]) -> str:
-    return f"linear-gradient(90deg, {', '.join(f'rgb({r} {g} {b})' for r, g, b in colors)})"
+def _css_gradient(colors: bytes) -> str:
+    stops = (f"rgb({r} {g} {b})" for r, g, b in zip(*[iter(colors)] * 3, strict=True))
+    return f"linear-gradient(90deg, {', '.join(stops)})"
 
 
 CSS_GRADIENT, CSS_ALPHA_GRADIENT = _css_gradient(_MAGMA), _css_gradient(_ALPHA)
@@ -164,11 +143,10 @@ def alpha_colors(differences: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h 
     return _colors_of((differences / ALPHA_SCALE + 1) / 2, _ALPHA)
 
 
-def _colors_of(
-    values: Float[np.ndarray, "h w"], colors: tuple[tuple[int, int, int], ...]
-) -> UInt8[np.ndarray, "h w 3"]:
+def _colors_of(values: Float[np.ndarray, "h w"], colors: bytes) -> UInt8[np.ndarray, "h w 3"]:
     """Map values in [0, 1] to colours by interpolation in a list of colours."""
-    positions, steps = np.linspace(0, 1, len(colors)), np.asarray(colors, dtype=np.float32)
+    steps = np.frombuffer(colors, np.uint8).reshape(-1, 3)
+    positions = np.linspace(0, 1, len(steps))
     channels = [np.interp(values, positions, steps[:, channel]) for channel in range(3)]
     return np.stack(channels, axis=2).round().astype(np.uint8)
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras, join_cameras
 from cvtgs.config.base import Record
+from cvtgs.counts import finite_numbers
 from cvtgs.errors import CvtgsError, InvalidArgumentError
 from cvtgs.evaluation.lpips import LEAST_PIXELS, LpipsNetwork, LpipsWeights, load_lpips, lpips
 from cvtgs.evaluation.metrics import alpha_bias, alpha_error, pair_psnr, ssim
@@ -150,24 +151,18 @@ class EvaluationSettings:
     backend: BackendName = "auto"
 
     def __post_init__(self) -> None:
-        if not _is_color(self.background):
+        color = finite_numbers(self.background, 3)
+        if color is None or not 0 <= min(color) <= max(color) <= 1:
             raise InvalidArgumentError(
                 f"background must be three numbers in [0, 1], found {shown(self.background)}."
             )
-        object.__setattr__(self, "background", tuple(map(float, self.background)))
+        object.__setattr__(self, "background", color)
         for name, choices in (("lpips", LpipsChoice), ("backend", BackendName)):
             if getattr(self, name) not in get_args(choices):
                 raise InvalidArgumentError(
                     f"{name} must be one of {', '.join(get_args(choices))}, "
                     f"found {shown(getattr(self, name))}."
                 )
-
-
-def _is_color(value: Sequence[float]) -> bool:
-    try:
-        return len(value) == 3 and all(0 <= channel <= 1 for channel in value)
-    except TypeError:  # a number or a text
-        return False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -122,19 +122,13 @@ class Case:
 
     def to(self, device: torch.device) -> "Case":
         """Return the case on a device."""
-        reference = self.reference
-        if reference.scene.device == device:
+        parts = self.reference._asdict()
+        if parts["scene"].device == device:
             return self
+        moved = {name: part.to(device) for name, part in parts.items() if name != "radius"}
         return replace(
             self,
-            reference=MergedScene(
-                scene=reference.scene.to(device),
-                merged=reference.merged.to(device),
-                partition=reference.partition.to(device),
-                neighbors=reference.neighbors.to(device),
-                visibility=reference.visibility.to(device),
-                radius=reference.radius,
-            ),
+            reference=self.reference._replace(**moved),
             cells=self.cells.to(device),
             descriptors=self.descriptors.to(device),
         )
