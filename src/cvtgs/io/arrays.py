@@ -1,7 +1,7 @@
 """Scenes as numpy arrays, and the conversions of parameters that compact formats share."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -17,14 +17,13 @@ from cvtgs.scene import GaussianScene
 from cvtgs.validity import writable_rows
 
 Floats = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 HALF_RANGE = np.float32(np.sqrt(0.5))  # bounds the three smaller components of a unit quaternion
 
 
 class Arrays(NamedTuple):
-    """The standard tensors of a scene, float32, on the CPU."""
+    """The standard tensors of a scene, float32, on the CPU, and the values that files store."""
 
     means: Float[np.ndarray, "n 3"]
     quats: Float[np.ndarray, "n 4"]
@@ -33,33 +32,58 @@ class Arrays(NamedTuple):
     sh0: Float[np.ndarray, "n 3"]
     shN: Float[np.ndarray, "n k 3"]  # noqa: N815 (the name that scenes give it)
 
+    @classmethod
+    def of(cls, scene: GaussianScene, *, sh_degree: int = 3) -> Self:
+        """Return the rows of a scene that a compact format can hold."""
+        rows = writable_rows(scene)
+        if not bool(rows.any()):
+            raise InvalidSceneError(
+                f"a scene to write must hold a Gaussian with finite values, found 0 of "
+                f"{len(scene):,}."
+            )
+        whole = bool(rows.all())
+        own = {
+            name: (tensor if whole else tensor[rows]).detach().cpu().float().numpy()
+            for name, tensor in scene.tensors().items()
+        }
+        own["quats"] = unit_quats(own["quats"])
+        own["sh0"] = own["sh0"][:, 0]
+        own["shN"] = own["shN"][:, : REST_COUNTS[sh_degree]]
+        return cls(**own)
 
-def arrays_of(scene: GaussianScene, *, sh_degree: int = 3) -> Arrays:
-    """Return the rows of a scene that a compact format can hold."""
-    rows = writable_rows(scene)
-    if not bool(rows.any()):
-        raise InvalidSceneError(
-            f"a scene to write must hold a Gaussian with finite values, found 0 of {len(scene):,}."
-        )
-    whole = bool(rows.all())
-    own = {
-        name: (tensor if whole else tensor[rows]).detach().cpu().float().numpy()
-        for name, tensor in scene.tensors().items()
-    }
-    own["quats"] = unit_quats(own["quats"])
-    own["sh0"] = own["sh0"][:, 0]
-    own["shN"] = own["shN"][:, : REST_COUNTS[sh_degree]]
-    return Arrays(**own)
+    def scene(self, *, comments: Sequence[str] = ()) -> GaussianScene:
+        """Build a scene."""
+        tensors = {
+            name: torch.from_numpy(np.require(values, np.float32, ["C", "W"]))
+            for name, values in self._asdict().items()
+        }
+        tensors["sh0"] = tensors["sh0"][:, None, :]
+        return GaussianScene(**tensors, extras={}, comments=tuple(comments), layout=())
 
+    def chunks(self, rows: int) -> Iterator["Arrays"]:
+        """Yield consecutive rows, at most so many at a time, without copying them."""
+        for start in range(0, len(self.means), rows):
+            yield Arrays(*(values[start : start + rows] for values in self))
 
-def scene_of(arrays: Arrays, *, comments: Sequence[str] = ()) -> GaussianScene:
-    """Build a scene."""
-    tensors = {
-        name: torch.from_numpy(np.require(values, np.float32, ["C", "W"]))
-        for name, values in arrays._asdict().items()
-    }
-    tensors["sh0"] = tensors["sh0"][:, None, :]
-    return GaussianScene(**tensors, extras={}, comments=tuple(comments), layout=())
+    @property
+    def scales(self) -> Float[np.ndarray, "n 3"]:
+        """Scales of clamped logarithms, as formats with scales store them."""
+        return np.asarray(np.exp(np.clip(self.log_scales, *SCALE_RANGE)))
+
+    @property
+    def opacities(self) -> Float[np.ndarray, "n"]:
+        """Opacities from 0 to 1."""
+        return parameters.opacity_from_logit(torch.from_numpy(self.logit_opacities)).numpy()
+
+    @property
+    def opacity_bytes(self) -> UInt8[np.ndarray, "n"]:
+        """Opacities as bytes."""
+        return to_bytes(255 * self.opacities)
+
+    @property
+    def colors(self) -> Float[np.ndarray, "n 3"]:
+        """Colours of the constant SH band, the inverse of :func:`sh0_of_colors`."""
+        return np.float32(0.5) + np.float32(SH_C0) * self.sh0
 
 
 def unit_quats(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
@@ -84,24 +108,9 @@ def log_scales_of(scales: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         return np.asarray(np.log(np.maximum(scales, np.finfo(np.float32).tiny)))
 
 
-def scales_of(log_scales: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return the scales of clamped logarithms, as formats with scales store them."""
-    return np.asarray(np.exp(np.clip(log_scales, *SCALE_RANGE)))
-
-
-def opacities_of(logits: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Return the opacities of logits."""
-    return parameters.opacity_from_logit(torch.from_numpy(logits)).numpy()
-
-
 def logits_of(opacities: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Return the logits of opacities."""
     return parameters.logit_from_opacity(torch.from_numpy(opacities)).numpy()
-
-
-def opacity_bytes(logits: Float[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
-    """Return the opacities of logits as bytes."""
-    return to_bytes(255 * opacities_of(logits))
 
 
 def logits_of_bytes(opacities: UInt8[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
@@ -109,13 +118,8 @@ def logits_of_bytes(opacities: UInt8[np.ndarray, "n"]) -> Float[np.ndarray, "n"]
     return logits_of(opacities.astype(np.float32) / np.float32(255))
 
 
-def colors_of_sh0(sh0: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return the colours of the constant SH band."""
-    return np.float32(0.5) + np.float32(SH_C0) * sh0
-
-
 def sh0_of_colors(colors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return the constant SH band of colours, the inverse of :func:`colors_of_sh0`."""
+    """Return the constant SH band of colours."""
     return (colors - np.float32(0.5)) / np.float32(SH_C0)
 
 

@@ -11,15 +11,11 @@ from cvtgs.errors import FileFormatError
 from cvtgs.io.arrays import (
     HALF_RANGE,
     Arrays,
-    arrays_of,
-    colors_of_sh0,
     drop_largest,
     in_radii,
     logits_of_bytes,
     morton_rows,
-    opacity_bytes,
     restore_largest,
-    scene_of,
     sh0_of_colors,
 )
 from cvtgs.io.files import open_input
@@ -72,7 +68,7 @@ def read_compressed_ply(path: Path) -> GaussianScene:
             if table.properties
         }
     with np.errstate(all="ignore"):  # damaged ranges give non-finite numbers
-        return scene_of(_unpacked(tables), comments=header.comments)
+        return _unpacked(tables).scene(comments=header.comments)
 
 
 def _unpacked(tables: dict[str, Rows]) -> Arrays:
@@ -164,7 +160,7 @@ def write_compressed_ply(scene: GaussianScene, file: BinaryIO) -> None:
     Rows are sorted along a Morton curve, so that the 256 Gaussians of a chunk lie close together
     and their common ranges are small. Flyaways come last.
     """
-    arrays = arrays_of(scene)
+    arrays = Arrays.of(scene)
     order = _flyaways_last(arrays, morton_rows(arrays.means))
     rest = arrays.shN[order].transpose(0, 2, 1).reshape(len(order), -1)
     elements = [
@@ -176,10 +172,10 @@ def write_compressed_ply(scene: GaussianScene, file: BinaryIO) -> None:
         elements.append(("sh", len(order), tuple((name, "uchar") for name in names)))
     file.write(header_bytes(scene.comments, elements))
     log_scales = np.clip(arrays.log_scales, *FORMAT_LIMITS[".compressed.ply"].ranges["log_scales"])
-    opacities = opacity_bytes(arrays.logit_opacities)[order].astype(np.uint32)
+    opacities = arrays.opacity_bytes[order].astype(np.uint32)
     place, place_range = _fractions(arrays.means[order])
     scale, scale_range = _fractions(log_scales[order])
-    color, color_range = _fractions(colors_of_sh0(arrays.sh0[order]))
+    color, color_range = _fractions(arrays.colors[order])
     largest, others = drop_largest(arrays.quats[order])
     words = [
         _pack(place, _THREE_BITS),

@@ -12,13 +12,8 @@ from jaxtyping import Float, Int
 from cvtgs.errors import FileFormatError
 from cvtgs.io.arrays import (
     Arrays,
-    arrays_of,
-    colors_of_sh0,
     log_scales_of,
     logits_of_bytes,
-    opacity_bytes,
-    scales_of,
-    scene_of,
     sh0_of_colors,
     to_bytes,
     unit_quats,
@@ -52,29 +47,25 @@ def read_splat(path: Path) -> GaussianScene:
             )
         file.seek(0)
         rows = np.fromfile(file, _ROW)
-    return scene_of(
-        Arrays(
-            means=rows["mean"],
-            quats=unit_quats((rows["quat"].astype(np.float32) - 128) / np.float32(128)),
-            log_scales=log_scales_of(rows["scale"]),
-            logit_opacities=logits_of_bytes(rows["opacity"]),
-            sh0=sh0_of_colors(rows["rgb"].astype(np.float32) / np.float32(255)),
-            shN=np.empty((len(rows), 0, 3), np.float32),
-        )
-    )
+    return Arrays(
+        means=rows["mean"],
+        quats=unit_quats((rows["quat"].astype(np.float32) - 128) / np.float32(128)),
+        log_scales=log_scales_of(rows["scale"]),
+        logit_opacities=logits_of_bytes(rows["opacity"]),
+        sh0=sh0_of_colors(rows["rgb"].astype(np.float32) / np.float32(255)),
+        shN=np.empty((len(rows), 0, 3), np.float32),
+    ).scene()
 
 
 def write_splat(scene: GaussianScene, file: BinaryIO) -> None:
     """Write a ``.splat`` file, in the order of the scene."""
-    arrays = arrays_of(scene, sh_degree=0)
-    for start in range(0, len(arrays.means), _CHUNK_ROWS):
-        part = slice(start, start + _CHUNK_ROWS)
-        rows = np.empty(len(arrays.means[part]), _ROW)
-        rows["mean"] = arrays.means[part]
-        rows["scale"] = scales_of(arrays.log_scales[part])
-        rows["rgb"] = to_bytes(255 * colors_of_sh0(arrays.sh0[part]))
-        rows["opacity"] = opacity_bytes(arrays.logit_opacities[part])
-        rows["quat"] = to_bytes(128 + 128 * arrays.quats[part])
+    for part in Arrays.of(scene, sh_degree=0).chunks(_CHUNK_ROWS):
+        rows = np.empty(len(part.means), _ROW)
+        rows["mean"] = part.means
+        rows["scale"] = part.scales
+        rows["rgb"] = to_bytes(255 * part.colors)
+        rows["opacity"] = part.opacity_bytes
+        rows["quat"] = to_bytes(128 + 128 * part.quats)
         file.write(rows.tobytes())
 
 
@@ -134,7 +125,7 @@ def read_ksplat(path: Path) -> GaussianScene:
         raise FileFormatError(
             f"{path}: must hold the {count:,} Gaussians of the header, at least 1, found {found:,}."
         )
-    return scene_of(Arrays(*map(np.concatenate, zip(*parts, strict=True))))
+    return Arrays(*map(np.concatenate, zip(*parts, strict=True))).scene()
 
 
 def _row_type(level: int, degree: int, path: Path) -> np.dtype[Any]:

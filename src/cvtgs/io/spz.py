@@ -18,12 +18,9 @@ from cvtgs.errors import DroppedDataWarning, FileFormatError, InvalidArgumentErr
 from cvtgs.io.arrays import (
     HALF_RANGE,
     Arrays,
-    arrays_of,
     drop_largest,
     logits_of_bytes,
-    opacity_bytes,
     restore_largest,
-    scene_of,
     to_bytes,
 )
 from cvtgs.io.axes import AXES, SCENE_AXES, change_axes, checked_axes
@@ -136,7 +133,7 @@ def decode_spz(
         sh0=(colors - np.float32(0.5)) / _COLOR_SCALE,
         shN=(rest.astype(np.float32) - 128) / 128,
     )
-    scene = scene_of(arrays, comments=[ANTIALIASED.text] if header.flags & _ANTIALIASED else ())
+    scene = arrays.scene(comments=[ANTIALIASED.text] if header.flags & _ANTIALIASED else ())
     return change_axes(scene, axes or stated or SCENE_AXES, SCENE_AXES)
 
 
@@ -315,7 +312,7 @@ def write_spz(
     if whole_number(version) not in get_args(Version):
         raise InvalidArgumentError(f"the version of an .spz must be 2, 3 or 4, found {version!r}.")
     number = 1 + AXES.index(checked_axes(axes))
-    arrays = arrays_of(scene)
+    arrays = Arrays.of(scene)
     header = SpzHeader(
         version=version,
         count=len(arrays.means),
@@ -364,14 +361,13 @@ def fractional_bits(scene: GaussianScene) -> int:
 
 def _blocks(arrays: Arrays, header: SpzHeader) -> Iterator[Iterator[UInt8[np.ndarray, "n b"]]]:
     """Yield the blocks in the order of the file, each in chunks."""
-    rows = range(0, len(arrays.means), _CHUNK_ROWS)
-    parts = [slice(start, start + _CHUNK_ROWS) for start in rows]
-    yield (_pack_means(arrays.means[part], header.fractional_bits) for part in parts)
-    yield (opacity_bytes(arrays.logit_opacities[part]) for part in parts)
-    yield (to_bytes(255 * (_COLOR_SCALE * arrays.sh0[part] + 0.5)) for part in parts)
-    yield (to_bytes(16 * (arrays.log_scales[part] + 10)) for part in parts)
-    yield (_pack_quats(arrays.quats[part], header.version) for part in parts)
-    yield (_pack_rest(arrays.shN[part]) for part in parts)
+    parts = list(arrays.chunks(_CHUNK_ROWS))
+    yield (_pack_means(part.means, header.fractional_bits) for part in parts)
+    yield (part.opacity_bytes for part in parts)
+    yield (to_bytes(255 * (_COLOR_SCALE * part.sh0 + 0.5)) for part in parts)
+    yield (to_bytes(16 * (part.log_scales + 10)) for part in parts)
+    yield (_pack_quats(part.quats, header.version) for part in parts)
+    yield (_pack_rest(part.shN) for part in parts)
 
 
 def _pack_means(means: Float[np.ndarray, "n 3"], bits: int) -> UInt8[np.ndarray, "n b"]:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from cvtgs.io.arrays import Arrays, Floats, arrays_of, opacities_of, scales_of
+from cvtgs.io.arrays import Arrays, Floats
 from cvtgs.math.parameters import build_covariances
 from cvtgs.math.spherical_harmonics import degree_of
 from cvtgs.scene import GaussianScene
@@ -19,7 +19,7 @@ _SIGMAS = 3.0  # extent of a Gaussian in the bounds, in standard deviations
 
 def write_usda(scene: GaussianScene, file: BinaryIO) -> None:
     """Write a stage with one prim, in the order and axes of the scene, with float32 precision."""
-    file.writelines(text.encode() for text in _document(scene, arrays_of(scene)))
+    file.writelines(text.encode() for text in _document(scene, Arrays.of(scene)))
 
 
 def _document(scene: GaussianScene, arrays: Arrays) -> Iterator[str]:
@@ -31,8 +31,8 @@ def _document(scene: GaussianScene, arrays: Arrays) -> Iterator[str]:
     yield from _array("float3[] extent", _extent(arrays))
     yield from _array("point3f[] positions", arrays.means)
     yield from _array("quatf[] orientations", arrays.quats)
-    yield from _array("float3[] scales", scales_of(arrays.log_scales))
-    yield from _array("float[] opacities", opacities_of(arrays.logit_opacities))
+    yield from _array("float3[] scales", arrays.scales)
+    yield from _array("float[] opacities", arrays.opacities)
     degree = degree_of(arrays.shN.shape[1])
     yield f"    uniform int radiance:sphericalHarmonicsDegree = {degree}\n"
     bands = np.concatenate([arrays.sh0[:, None], arrays.shN], axis=1).reshape(-1, 3)
@@ -54,14 +54,13 @@ def _array(name: str, values: Floats) -> Iterator[str]:
 def _extent(arrays: Arrays) -> Float[np.ndarray, "2 3"]:
     """Return the corners of a box around all Gaussians."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for start in range(0, len(arrays.means), _CHUNK_ROWS):
-        part = slice(start, start + _CHUNK_ROWS)
-        scales = torch.from_numpy(scales_of(arrays.log_scales[part]).astype(np.float64))
-        quats = torch.from_numpy(arrays.quats[part].astype(np.float64))
+    for part in arrays.chunks(_CHUNK_ROWS):
+        scales = torch.from_numpy(part.scales.astype(np.float64))
+        quats = torch.from_numpy(part.quats.astype(np.float64))
         variances = build_covariances(scales, quats).diagonal(dim1=1, dim2=2).numpy()
         reach = _SIGMAS * np.sqrt(variances)
-        low = np.minimum(low, (arrays.means[part] - reach).min(axis=0))
-        high = np.maximum(high, (arrays.means[part] + reach).max(axis=0))
+        low = np.minimum(low, (part.means - reach).min(axis=0))
+        high = np.maximum(high, (part.means + reach).max(axis=0))
     most = float(np.finfo(np.float32).max)
     return np.stack([low, high]).clip(-most, most)
 

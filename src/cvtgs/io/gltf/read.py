@@ -13,7 +13,7 @@ from pydantic import Field
 
 from cvtgs.edit import Motion, concatenate, move
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn
-from cvtgs.io.arrays import Arrays, log_scales_of, logits_of, scene_of, unit_quats
+from cvtgs.io.arrays import Arrays, log_scales_of, logits_of, unit_quats
 from cvtgs.io.axes import SCENE_AXES, change_axes
 from cvtgs.io.files import (
     Document,
@@ -254,16 +254,14 @@ def _read_attributes(file: GltfFile, one: _Splats) -> GaussianScene:
         warn(f"{file.path}: left out SH coefficients above degree 3.", DroppedDataWarning)
     bands = range(1, 1 + _degree(file, one))
     rest = [rows(name, "VEC3") for band in bands for name in gltf.coefficients(band)]
-    return scene_of(
-        Arrays(
-            means=means,
-            quats=unit_quats(np.roll(quats, 1, axis=1)),
-            log_scales=log_scales_of(scales),
-            logit_opacities=logits_of(opacities),
-            sh0=rows(gltf.coefficients(0)[0], "VEC3"),
-            shN=np.stack(rest, axis=1) if rest else np.empty((len(means), 0, 3), np.float32),
-        )
-    )
+    return Arrays(
+        means=means,
+        quats=unit_quats(np.roll(quats, 1, axis=1)),
+        log_scales=log_scales_of(scales),
+        logit_opacities=logits_of(opacities),
+        sh0=rows(gltf.coefficients(0)[0], "VEC3"),
+        shN=np.stack(rest, axis=1) if rest else np.empty((len(means), 0, 3), np.float32),
+    ).scene()
 
 
 def _index(file: GltfFile, one: _Splats, name: str) -> int:

@@ -10,16 +10,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from cvtgs.errors import InvalidSceneError
-from cvtgs.io.arrays import (
-    Arrays,
-    Bytes,
-    arrays_of,
-    colors_of_sh0,
-    opacities_of,
-    opacity_bytes,
-    scales_of,
-    to_bytes,
-)
+from cvtgs.io.arrays import Arrays, to_bytes
 from cvtgs.io.gltf import document as gltf
 from cvtgs.io.spz import write_spz
 from cvtgs.math.spherical_harmonics import degree_of
@@ -37,7 +28,7 @@ class _Attribute(NamedTuple):
 
     name: str
     kind: str
-    values: Callable[[slice], Shaped[np.ndarray, "n k"]]
+    values: Callable[[Arrays], Shaped[np.ndarray, "n k"]]
 
     @property
     def component(self) -> int:
@@ -47,24 +38,24 @@ class _Attribute(NamedTuple):
     def row_bytes(self) -> int:
         return gltf.WIDTHS[self.kind] * gltf.COMPONENTS[self.component].itemsize
 
-    def parts(self, count: int) -> Iterator[bytes]:
-        for start in range(0, count, _CHUNK_ROWS):
-            values = self.values(slice(start, min(start + _CHUNK_ROWS, count)))
+    def parts(self, arrays: Arrays) -> Iterator[bytes]:
+        for part in arrays.chunks(_CHUNK_ROWS):
+            values = self.values(part)
             yield np.ascontiguousarray(values, gltf.COMPONENTS[self.component]).tobytes()
 
 
 def write_glb(scene: GaussianScene, file: BinaryIO) -> None:
     """Write a ``.glb`` with ``KHR_gaussian_splatting``, in the order and the axes of the scene."""
-    arrays = arrays_of(scene)
+    arrays = Arrays.of(scene)
     attributes, count = _attributes(arrays), len(arrays.means)
     document = _document(scene, arrays, attributes)
     size = count * sum(one.row_bytes for one in attributes)
-    write_chunks(file, document, size, (part for one in attributes for part in one.parts(count)))
+    write_chunks(file, document, size, (part for one in attributes for part in one.parts(arrays)))
 
 
 def write_gltf(scene: GaussianScene, file: BinaryIO) -> None:
     """Write a ``.gltf`` like :func:`write_glb`, but as one JSON text with numbers in base64."""
-    arrays = arrays_of(scene)
+    arrays = Arrays.of(scene)
     attributes, count = _attributes(arrays), len(arrays.means)
     document = _document(scene, arrays, attributes)
     buffer = {"byteLength": count * sum(one.row_bytes for one in attributes), "uri": _DATA}
@@ -72,7 +63,7 @@ def write_gltf(scene: GaussianScene, file: BinaryIO) -> None:
     start, end = json_bytes(document | {"buffers": [buffer]})[:-4], b'"}]}'
     file.write(start)
     rest = b""
-    for part in (part for one in attributes for part in one.parts(count)):
+    for part in (part for one in attributes for part in one.parts(arrays)):
         rest += part
         whole = len(rest) // 3 * 3  # bytes that need no padding
         file.write(base64.b64encode(rest[:whole]))
@@ -86,7 +77,7 @@ def write_spz_glb(scene: GaussianScene, file: BinaryIO) -> None:
     The SPZ has the axes of the glTF, as CesiumJS reads it. Viewers without the extension show
     nothing.
     """
-    arrays = arrays_of(scene)
+    arrays = Arrays.of(scene)
     packed = io.BytesIO()
     write_spz(scene, packed, version=_SPZ_VERSION)
     content = packed.getvalue()
@@ -98,22 +89,21 @@ def write_spz_glb(scene: GaussianScene, file: BinaryIO) -> None:
 
 
 def _attributes(arrays: Arrays) -> list[_Attribute]:
-    def colors(part: slice) -> Bytes:
-        rgb = to_bytes(255 * colors_of_sh0(arrays.sh0[part]))
-        return np.column_stack([rgb, opacity_bytes(arrays.logit_opacities[part])])
+    def colors(part: Arrays) -> Shaped[np.ndarray, "n 4"]:
+        return np.column_stack([to_bytes(255 * part.colors), part.opacity_bytes])
 
-    def rest(number: int) -> Callable[[slice], Float[np.ndarray, "n 3"]]:
-        return lambda part: arrays.shN[part, number]
+    def rest(number: int) -> Callable[[Arrays], Float[np.ndarray, "n 3"]]:
+        return lambda part: part.shN[:, number]
 
     bands = range(1, 1 + degree_of(arrays.shN.shape[1]))
     names = [name for band in bands for name in gltf.coefficients(band)]
     return [
-        _Attribute(gltf.POSITION, "VEC3", lambda part: arrays.means[part]),
+        _Attribute(gltf.POSITION, "VEC3", lambda part: part.means),
         _Attribute(gltf.COLOR, "VEC4", colors),
-        _Attribute(gltf.ROTATION, "VEC4", lambda part: np.roll(arrays.quats[part], -1, axis=1)),
-        _Attribute(gltf.SCALE, "VEC3", lambda part: scales_of(arrays.log_scales[part])),
-        _Attribute(gltf.OPACITY, "SCALAR", lambda part: opacities_of(arrays.logit_opacities[part])),
-        _Attribute(gltf.coefficients(0)[0], "VEC3", lambda part: arrays.sh0[part]),
+        _Attribute(gltf.ROTATION, "VEC4", lambda part: np.roll(part.quats, -1, axis=1)),
+        _Attribute(gltf.SCALE, "VEC3", lambda part: part.scales),
+        _Attribute(gltf.OPACITY, "SCALAR", lambda part: part.opacities),
+        _Attribute(gltf.coefficients(0)[0], "VEC3", lambda part: part.sh0),
         *(_Attribute(name, "VEC3", rest(number)) for number, name in enumerate(names)),
     ]
 

@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from pydantic import AfterValidator, Field
 
 from cvtgs.errors import FileFormatError, is_out_of_memory
-from cvtgs.io.arrays import HALF_RANGE, Arrays, logits_of_bytes, restore_largest, scene_of
+from cvtgs.io.arrays import HALF_RANGE, Arrays, logits_of_bytes, restore_largest
 from cvtgs.io.files import (
     LONGEST_NAME,
     Document,
@@ -210,7 +210,7 @@ def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
     is_smooth = meta.model == "antialiased" or meta.antialias is True
     comments = [ANTIALIASED.text] if is_smooth else []
     comments += [TWO_SCALES.text] if meta.model == "2dgs" else []
-    return scene_of(arrays, comments=comments)
+    return arrays.scene(comments=comments)
 
 
 def _read_meta(content: Any, where: str) -> _Version1 | _Version2:

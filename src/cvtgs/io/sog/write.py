@@ -14,15 +14,7 @@ from torch import Tensor
 
 from cvtgs.devices import HOST, in_threads
 from cvtgs.errors import InvalidSceneError
-from cvtgs.io.arrays import (
-    HALF_RANGE,
-    Arrays,
-    arrays_of,
-    drop_largest,
-    morton_rows,
-    opacity_bytes,
-    to_bytes,
-)
+from cvtgs.io.arrays import HALF_RANGE, Arrays, drop_largest, morton_rows, to_bytes
 from cvtgs.io.sog.read import META, PALETTE_COLUMNS, QUAT_TAG
 from cvtgs.math.spherical_harmonics import degree_of
 from cvtgs.scene import GaussianScene
@@ -58,7 +50,7 @@ class EncodedSog(NamedTuple):
 
 def write_sog(scene: GaussianScene, file: BinaryIO) -> None:
     """Write a bundled SOG of version 2."""
-    arrays = arrays_of(scene)
+    arrays = Arrays.of(scene)
     encoded = _encoded(arrays, morton_rows(arrays.means), scene)
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(zipfile.ZipInfo(META, _TIME), json.dumps(encoded.meta))
@@ -78,7 +70,7 @@ def encode_sog(scene: GaussianScene) -> EncodedSog:
     Raises:
         InvalidSceneError: A Gaussian of the scene is not finite.
     """
-    arrays = arrays_of(scene)
+    arrays = Arrays.of(scene)
     if len(arrays.means) < len(scene):
         raise InvalidSceneError(
             f"every Gaussian must be finite to be written in the order of the scene, found "
@@ -90,7 +82,7 @@ def encode_sog(scene: GaussianScene) -> EncodedSog:
 def _encoded(arrays: Arrays, order: Int[np.ndarray, "n"], scene: GaussianScene) -> EncodedSog:
     scales = codebook(arrays.log_scales[order])
     colors = codebook(arrays.sh0[order])
-    opacities = opacity_bytes(arrays.logit_opacities)[order]
+    opacities = arrays.opacity_bytes[order]
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "cvtgs"}, "count": len(order)}
     if scene.antialiased:
         meta |= {"model": "antialiased", "antialias": True}
