@@ -1,5 +1,6 @@
 """Scores and images of simplified scenes against the full scene and against photographs."""
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -310,8 +311,8 @@ def _score_images(
                 f"{len(scene):,}; they are not drawn."
             )
     metrics = _checked_metrics(reference, cameras, photographs, settings, name=reference_name)
-    against_full: dict[str, list[ImageScores]] = {name: [] for name in scenes}
-    against_photographs: dict[str, list[ImageScores]] = {name: [] for name in scenes}
+    against_full = defaultdict[str, list[ImageScores]](list)
+    against_photographs = defaultdict[str, list[ImageScores]](list)
     blind: list[int] = []
     total, done = len(cameras) * len(scenes), 0
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
@@ -320,21 +321,19 @@ def _score_images(
         for name, scene in scenes.items():
             image = render_views(scene, camera, backend=settings.backend)
             color = image.over(scene.means.new_tensor(settings.background)).clamp(0, 1)
-            alpha = image.alpha
-            keep(name, view, color, alpha)
+            keep(name, view, color, image.alpha)
             if truth is None:
-                truth = color, alpha
-                if not shows(scene, camera, alpha):
+                truth = color, image.alpha
+                if not shows(scene, camera, image.alpha):
                     blind.append(view)
             else:
-                alphas = alpha, truth[1].to(alpha)
+                alphas = image.alpha, truth[1].to(image.alpha)
                 against_full[name].append(metrics.compare(color, truth[0], alphas=alphas))
             if photographs is not None:
                 found = metrics.compare(color, photographs[view : view + 1])
                 against_photographs[name].append(found)
             done += 1
             listener(ProgressEvent(stage=STAGE, done=done, total=total))
-    del against_full[reference_name]
     if blind:
         warn(
             f"{len(blind)} of {len(cameras)} views show nothing of {reference_name}, so they do "
@@ -357,6 +356,5 @@ def _score_images(
         photographs=tuple(
             scene_scores(name, len(scenes[name]), rows)
             for name, rows in against_photographs.items()
-            if rows
         ),
     )

@@ -21,7 +21,6 @@ from cvtgs.io.arrays import (
 from cvtgs.io.files import open_input
 from cvtgs.io.limits import FORMAT_LIMITS
 from cvtgs.io.ply.header import Header, check_size, header_bytes, read_header, row_dtype
-from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 
 __all__ = ["read_compressed_ply", "write_compressed_ply"]
@@ -115,42 +114,41 @@ def _rest(rows: Rows | None, count: int) -> Float[np.ndarray, "n k 3"]:
 
 
 def _check(header: Header, path: Path) -> None:
-    found = {table.name: table for table in header.elements}
+    tables = {table.name: dict(table.columns) for table in header.elements}
+    counts = {table.name: table.count for table in header.elements}
     has_lists = any(table.has_lists for table in header.elements)
     if header.encoding != "binary_little_endian" or has_lists:
         raise FileFormatError(
             f"{path}: a compressed PLY must be binary_little_endian without lists, found "
             f"{'a list' if has_lists else header.encoding}."
         )
-    chunk = found["chunk"].properties if "chunk" in found else ()
-    is_colored = any(prop.name in _RANGES[_UNCOLORED:] for prop in chunk)
+    is_colored = any(name in _RANGES[_UNCOLORED:] for name in tables.get("chunk", ()))
     for name, wanted, kind in (
         ("chunk", _RANGES if is_colored else _RANGES[:_UNCOLORED], "float"),
         ("vertex", _PACKED, "uint"),
     ):
-        types = {prop.name: prop.type for prop in found[name].properties} if name in found else {}
+        types = tables.get(name, {})
         for prop in wanted:
             if types.get(prop) != kind:
                 raise FileFormatError(
                     f"{path}: element {name!r} of a compressed PLY must have the {kind} property "
                     f"{prop!r}, found {types.get(prop, 'none')}."
                 )
-    vertices, chunks = found["vertex"].count, found["chunk"].count
+    vertices, chunks = counts["vertex"], counts["chunk"]
     if vertices == 0 or chunks != -(-vertices // _CHUNK_ROWS):
         raise FileFormatError(
             f"{path}: must hold at least one vertex and a chunk for every {_CHUNK_ROWS} of them, "
             f"found {vertices:,} vertices and {chunks:,} chunks."
         )
-    rest = found.get("sh")
-    if rest is None or not rest.properties:  # gsplat writes an empty one at SH degree 0
+    rest = tables.get("sh")
+    if not rest:  # gsplat writes an empty one at SH degree 0
         return
-    names = {prop.name for prop in rest.properties if prop.type == "uchar"}
-    own = {f"f_rest_{i}" for i in range(len(rest.properties))}
-    counts = [3 * count for count in REST_COUNTS]
-    if names != own or len(names) not in counts or rest.count != vertices:
+    names = {name for name, kind in rest.items() if kind == "uchar"}
+    own = {f"f_rest_{i}" for i in range(len(rest))}
+    if names != own or len(names) not in (9, 24, 45) or counts["sh"] != vertices:
         raise FileFormatError(
             f"{path}: element 'sh' must have 9, 24 or 45 uchar properties f_rest_0, f_rest_1, ... "
-            f"for each of {vertices:,} vertices, found {len(names)} for {rest.count:,}."
+            f"for each of {vertices:,} vertices, found {len(names)} for {counts['sh']:,}."
         )
 
 

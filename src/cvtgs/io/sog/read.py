@@ -214,10 +214,9 @@ def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
 
 
 def _read_meta(content: Any, where: str) -> _Version1 | _Version2:
-    is_first = (validated(_Root, content, where).version or 1) == 1
-    meta = (
-        validated(_Version1, content, where) if is_first else validated(_Version2, content, where)
-    )
+    is_second = validated(_Root, content, where).version == 2
+    model: type[_Version1 | _Version2] = _Version2 if is_second else _Version1
+    meta = validated(model, content, where)
     if not 0 < meta.count <= _MOST_COUNT:
         raise FileFormatError(
             f"{where}: must state 1 to {_MOST_COUNT:,} Gaussians, found {meta.count:,}."
