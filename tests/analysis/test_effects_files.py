@@ -77,7 +77,9 @@ def test_other_formats_give_the_same(source, suffix, tmp_path):
 
 @pytest.mark.parametrize("degree", [-1, 4])
 def test_an_invalid_degree_is_refused(source, degree):
-    with pytest.raises(InvalidArgumentError, match=f"must be from 0 to 3, found {degree}"):
+    with pytest.raises(
+        InvalidArgumentError, match=f"must be a whole number between 0 and 3, found {degree}"
+    ):
         cvtgs.load(source, sh_degree=degree)
 
 

@@ -286,7 +286,7 @@ def test_streams_that_break_and_closed_ones_are_refused() -> None:
         (
             lambda: cvtgs.load("a.ply", sh_degree=1.5),
             InvalidArgumentError,
-            "from 0 to 3",
+            "between 0 and 3",
         ),
         (lambda: cvtgs.load("a.ply", axes=5), InvalidArgumentError, "axes must be .* found 5"),
         (lambda: cvtgs.load("a.ply", format=5), FileFormatError, "format must be a suffix .* 5"),

@@ -258,7 +258,7 @@ def test_an_unknown_kind_is_refused_before_the_work(tmp_path: Path, source: Path
         ("sog", {"chunk_gaussians": "9"}, "chunk_gaussians must be a whole number above 0, f"),
         ("sog", {"axes": "rdf"}, "axes must be those of the input file and those of the output, f"),
         ("sog", {"axes": ("rdf", "xyz")}, "axes must be the directions .*; found 'xyz'"),
-        ("sog", {"sh_degree": 4}, "sh_degree must be from 0 to 3, found 4"),
+        ("sog", {"sh_degree": 4}, "sh_degree must be a whole number between 0 and 3, found 4"),
         ("sog", {"blocks": "3"}, "blocks must be a whole number above 0, found '3'"),
         (
             "sog",

@@ -13,16 +13,13 @@ from urllib.parse import unquote
 import pydantic
 from pydantic import AllowInfNan, BeforeValidator, Field, Strict
 
-from cvtgs.counts import whole_number
 from cvtgs.errors import (
     FileFormatError,
     InputError,
     InputNotFoundError,
-    InvalidArgumentError,
     check_path,
     input_errors,
 )
-from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.text import shown
 
 _POINTER = b"version https://git-lfs."  # replaces a large file in a clone without Git LFS
@@ -172,12 +169,6 @@ def _numbered(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
     matches = [(pattern.fullmatch(part.name), part) for part in folder.iterdir()]
     numbers = [(int(match[1]), part) for match, part in matches if match]
     return [part for _, part in sorted(numbers, reverse=True)]
-
-
-def check_degree(degree: object) -> None:
-    """Raise unless a value is an SH degree."""
-    if whole_number(degree) not in range(len(REST_COUNTS)):
-        raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {shown(degree)}.")
 
 
 def check_expansion(path: Path | str, *, count: int, sh_degree: int, stored: int) -> None:

@@ -12,6 +12,7 @@ from typing import Any, BinaryIO, Literal
 import numpy as np
 import torch
 
+from cvtgs.counts import checked_whole
 from cvtgs.devices import threads_for_chunks, usable_device
 from cvtgs.errors import (
     BLOCKS_ADVICE,
@@ -24,7 +25,7 @@ from cvtgs.errors import (
 )
 from cvtgs.io.atomic import atomic_output, check_output
 from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
-from cvtgs.io.files import check_degree, is_file, scene_file
+from cvtgs.io.files import is_file, scene_file
 from cvtgs.io.limits import FORMAT_LIMITS, SPZ_2, Losses, losses_within
 from cvtgs.io.streams import ByteSink, ByteSource, file_of, name_of, written_to
 from cvtgs.math.spherical_harmonics import REST_COUNTS
@@ -123,7 +124,7 @@ def load(
     """
     usable_device(device)
     if sh_degree is not None:
-        check_degree(sh_degree)
+        checked_whole(sh_degree, "sh_degree", least=0, most=3)
     given: dict[str, Any] = {"sh_degree": sh_degree, "extras": extras, "trust_sizes": trust_sizes}
     given["axes"] = axes = None if axes is None else checked_axes(axes)
     given["lod"] = 0 if lod is None else lod

@@ -26,7 +26,6 @@ from cvtgs.grouping import allocate, finer_count, order_rows, tessellate_rows, w
 from cvtgs.io import change_axes
 from cvtgs.io.atomic import make_folder
 from cvtgs.io.axes import SCENE_AXES, checked_axes
-from cvtgs.io.files import check_degree
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
 from cvtgs.mergenet import Checkpoint
@@ -222,7 +221,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
     check_config(simplifier.config, with_images=False)
     check_memory(memory, with_images=False)
     if sh_degree is not None:
-        check_degree(sh_degree)
+        checked_whole(sh_degree, "sh_degree", least=0, most=3)
     rows = open_rows(source)
     ratios = written_ratios(rhos)
     targets = sorted({target_count(rows.count, rho) for rho in ratios}, reverse=True)

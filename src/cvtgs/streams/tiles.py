@@ -3,7 +3,7 @@
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from cvtgs.boxes import Corner
 from cvtgs.checks import checked
-from cvtgs.counts import checked_whole, real_number
+from cvtgs.counts import checked_whole, finite_numbers, real_number
 from cvtgs.devices import on_host
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io import atomic_output
@@ -231,10 +231,8 @@ def check_transform(numbers: Sequence[float] | None) -> tuple[float, ...]:
     """Return the transform of a tileset, 16 numbers by columns; raise unless it is invertible."""
     if numbers is None:
         return _UNMOVED
-    values = tuple(map(real_number, numbers)) if isinstance(numbers, Iterable) else ()
-    is_matrix = len(values) == 16 and all(map(math.isfinite, values))
-    last = values[3::4]
-    if is_matrix and last == (0.0, 0.0, 0.0, 1.0):
+    values = finite_numbers(numbers, 16)
+    if values is not None and values[3::4] == (0.0, 0.0, 0.0, 1.0):
         matrix = torch.tensor(values, dtype=torch.float64).reshape(4, 4)[:3, :3]
         if abs(float(torch.linalg.det(matrix))) > 0.0:
             return values

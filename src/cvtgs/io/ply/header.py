@@ -255,11 +255,6 @@ def rest_index(name: str) -> int | None:
     return int(match[1]) if match else None
 
 
-def rest_count_of(names: Iterable[str]) -> int:
-    """Count the view-dependent SH coefficients per channel."""
-    return sum(rest_index(name) is not None for name in names) // 3
-
-
 def dtype_of(layout: Layout) -> torch.dtype:
     """Return the dtype of a scene that was read from this layout."""
     types = dict(layout)

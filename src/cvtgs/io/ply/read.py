@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvtgs.counts import whole_number
+from cvtgs.counts import checked_whole
 from cvtgs.errors import (
     DroppedDataWarning,
     FileFormatError,
@@ -25,7 +25,7 @@ from cvtgs.errors import (
     warn,
 )
 from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
-from cvtgs.io.files import check_degree, open_input
+from cvtgs.io.files import open_input
 from cvtgs.io.ply import header as ply
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import FLAT_LOG_SCALE, NORMALS, GaussianScene
@@ -86,7 +86,8 @@ def assemble(
 ) -> GaussianScene:
     """Copy rows into a new scene, chunk by chunk; memory is the scene plus that of chunks."""
     types = dict(layout)
-    tensors = _empty_tensors(count, ply.rest_count_of(types), ply.dtype_of(layout))
+    rest_count = sum(ply.rest_index(name) is not None for name in types) // 3
+    tensors = _empty_tensors(count, rest_count, ply.dtype_of(layout))
     extras = {
         name: torch.empty(count, dtype=ply.SCALARS[kind].dtype, device="cpu")
         for name, kind in layout
@@ -308,7 +309,7 @@ def open_rows(
     Scenes are converted from ``axes``, those of PLY files unless given.
     """
     if sh_degree is not None:
-        check_degree(sh_degree)
+        sh_degree = checked_whole(sh_degree, "sh_degree", least=0, most=3)
     name = os.fspath(path)
     refusal = FileFormatError(
         f"{name}: only binary little endian PLY files with vertices first can be read in parts; "
@@ -330,6 +331,6 @@ def open_rows(
         layout=ply.layout_of(vertex),
         comments=header.comments,
         offset=header.data_offset,
-        sh_degree=None if sh_degree is None else whole_number(sh_degree),
+        sh_degree=sh_degree,
         axes=SCENE_AXES if axes is None else checked_axes(axes),
     )
