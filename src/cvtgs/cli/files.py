@@ -14,20 +14,13 @@ from cvtgs.cli.jobs import (
     STANDARD_INPUT,
     STREAM,
     Outcome,
-    SceneJob,
     add_paths,
     input_file,
     make_output_folder,
     open_jobs,
     run_jobs,
 )
-from cvtgs.cli.options import (
-    AddParser,
-    add_options,
-    read_numbers,
-    read_scene,
-    read_settings,
-)
+from cvtgs.cli.options import AddParser, add_options, read_numbers, read_scene, read_settings
 from cvtgs.cli.paths import any_path
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, warn, without_warnings
 from cvtgs.tags import TWO_SCALES, described_tags
@@ -294,10 +287,10 @@ def convert(options: argparse.Namespace) -> None:
     edits = read_edits(options)
     with open_jobs(options) as jobs:
         for job in jobs:
-            cvtgs.io.check_save(job.options.output, overwrite=options.overwrite)
-            if options.spz_version and not job.options.output.name.lower().endswith(".spz"):
+            cvtgs.io.check_save(job.output, overwrite=options.overwrite)
+            if options.spz_version and not job.output.name.lower().endswith(".spz"):
                 stream = "standard output without --suffix .spz"
-                found = stream if job.to_stream else job.options.output.name
+                found = stream if job.to_stream else job.output.name
                 raise InvalidArgumentError(f"--spz-version needs a .spz to write, found {found}.")
         run_jobs(jobs, lambda job: _convert_one(job, edits))
 
@@ -307,11 +300,10 @@ def _format_of(path: Path) -> str:
     return ".sog" if suffix == ".json" else suffix  # a .sog is a packed meta.json
 
 
-def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
+def _convert_one(options: argparse.Namespace, edits: Sequence[tuple[str, Edit]]) -> Outcome:
     """Convert one scene, and report the data that is lost."""
     from cvtgs.io.limits import LOST_DIGITS
 
-    options = job.options
     axes, trust = options.axes, options.trust_sizes
     scenes = [cvtgs.io.load(options.input, axes=axes.source, trust_sizes=trust, lod=options.lod)]
     for path in options.merge:
@@ -336,16 +328,17 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
     lost = cvtgs.io.losses(scene, options.output, spz_version=version)
     if any(phrase.startswith(LOST_DIGITS) for phrase in lost.dropped):  # of edits and of the file
         phrases = [phrase for phrase in phrases if not phrase.startswith(LOST_DIGITS)]
-    if not (options.quiet or job.is_one_of_many):
+    lines = [*phrases, *lost.dropped]
+    if not options.quiet and options.folder is None:
         stream, files = sys.stdout, f"files like {options.output.name}"
-        if job.to_stream:
+        if options.to_stream:
             stream, files = sys.stderr, f"{options.suffix} files"
         if lost.changed:
             say(f"In {files}:", file=stream)
         for phrase in lost.changed:
             say_wrapped(phrase, indent=2, file=stream)
         rest = "nothing else" if lost.changed else "nothing"
-        say_wrapped(f"Lost: {'; '.join([*phrases, *lost.dropped]) or rest}.", file=stream)
+        say_wrapped(f"Lost: {'; '.join(lines) or rest}.", file=stream)
     unasked = [phrase for phrase in phrases if phrase.startswith((LOST_DIGITS, "the tag"))]
     if options.quiet and unasked:  # columns and what the format cannot hold have warnings already
         warn(f"{options.input}: lost {'; '.join(unasked)}.", DroppedDataWarning)
@@ -358,6 +351,5 @@ def _convert_one(job: SceneJob, edits: Sequence[tuple[str, Edit]]) -> Outcome:
             axes=axes.target,
             spz_version=version,
         )
-    lines = [*phrases, *lost.dropped]
-    notes = [f"Lost: {'; '.join(lines)}."] if job.is_one_of_many and lines else []
+    notes = [f"Lost: {'; '.join(lines)}."] if options.folder is not None and lines else []
     return Outcome(f"{counted(lost.count, 'Gaussian')} of SH degree {lost.sh_degree}", notes=notes)

@@ -7,7 +7,6 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -43,15 +42,6 @@ class Outcome(NamedTuple):
         """Return counts, bytes and seconds in one line; None if the output was moved away."""
         sizes = f"{size_text(before)} -> {'moved away' if after is None else size_text(after)}"
         return ", ".join(filter(None, (self.counts, sizes, self.seconds)))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SceneJob:
-    """The options of a command, with ``input`` and ``output`` of one scene."""
-
-    options: argparse.Namespace
-    is_one_of_many: bool = False  # the command writes to a directory (-o DIR)
-    to_stream: bool = False  # the output is copied to standard output
 
 
 def add_paths(parser: CommandParser, *, options: str) -> None:
@@ -113,8 +103,12 @@ def check_paths(parser: CommandParser, options: argparse.Namespace) -> None:
 
 
 @contextmanager
-def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
-    """Find the scenes of a command; standard streams are temporary files within the context."""
+def open_jobs(options: argparse.Namespace) -> Iterator[list[argparse.Namespace]]:
+    """Return the options of a command for each of its scenes, with ``input`` and ``output``.
+
+    With ``to_stream``, the output is copied to standard output. Standard streams are temporary
+    files within the context.
+    """
     from cvtgs.io.streams import named_in_warnings
 
     check_suffix(options.suffix)
@@ -132,10 +126,9 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
             folder = stack.enter_context(TemporaryDirectory(prefix="cvtgs-"))
             target = f"{folder}/standard-output{options.suffix or '.ply'}"
             stack.enter_context(named_in_warnings(Path(target), STANDARD_OUTPUT))
-        own = {"input": stack.enter_context(input_file(source)), "output": Path(target)}
-        job = argparse.Namespace(**{**vars(options), **own})
+        file = stack.enter_context(input_file(source))
         try:
-            yield [SceneJob(options=job, to_stream=to_stream)]
+            yield [_with_paths(options, file, Path(target), to_stream=to_stream)]
         except OutputError as error:
             if not (to_stream and str(target) in str(error)):
                 raise
@@ -144,6 +137,13 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
                 "the folder of temporary files must be writable and have room for the output, "
                 f"found: {reason.removesuffix('.')}; TMPDIR sets another folder."
             ) from error
+
+
+def _with_paths(
+    options: argparse.Namespace, source: Path, target: Path, *, to_stream: bool = False
+) -> argparse.Namespace:
+    own = {"input": source, "output": target, "to_stream": to_stream}
+    return argparse.Namespace(**{**vars(options), **own})
 
 
 @contextmanager
@@ -173,19 +173,18 @@ def check_suffix(suffix: str | None) -> None:
 
 
 def run_jobs(
-    jobs: Sequence[SceneJob],
-    work: Callable[[SceneJob], Outcome],
-    failed: Callable[[SceneJob, CvtgsError], None] = lambda job, error: None,
+    jobs: Sequence[argparse.Namespace],
+    work: Callable[[argparse.Namespace], Outcome],
+    failed: Callable[[argparse.Namespace, CvtgsError], None] = lambda job, error: None,
 ) -> None:
     """Call ``work`` for every scene and print the results; go on if one of many has ``failed``."""
-    first = jobs[0]
-    if not first.is_one_of_many:
-        _run_one(first, work)
+    folder, quiet, failures = jobs[0].folder, jobs[0].quiet, 0
+    if folder is None:
+        _run_one(jobs[0], work)
         return
-    folder, quiet, failures = first.options.folder, first.options.quiet, 0
     before = after = 0
     for number, job in enumerate(jobs, start=1):
-        source, target = job.options.input, job.options.output
+        source, target = job.input, job.output
         place = f"[{number:>{len(str(len(jobs)))}}/{len(jobs)}] "
         outcome = None
         try:
@@ -218,13 +217,12 @@ def run_jobs(
         say(f"{scenes} in {folder}, {size_text(before)} -> {size_text(after)}")
 
 
-def _run_one(job: SceneJob, work: Callable[[SceneJob], Outcome]) -> None:
-    options = job.options
+def _run_one(options: argparse.Namespace, work: Callable[[argparse.Namespace], Outcome]) -> None:
     before = cvtgs.io.scene_size(options.input)
-    outcome = work(job)
+    outcome = work(options)
     facts = outcome.facts(before, _size_of_output(options.output))
     stream, name = sys.stdout, printable_name(str(options.output))
-    if job.to_stream:
+    if options.to_stream:
         stream, name = sys.stderr, STANDARD_OUTPUT
         send_file(options.output)
     if options.quiet:
@@ -246,8 +244,8 @@ def _size_of_output(path: Path) -> int | None:
         return None
 
 
-def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
-    """Return a job for every input; raise if two would write the same file."""
+def _folder_jobs(options: argparse.Namespace) -> list[argparse.Namespace]:
+    """Return the options for every input; raise if two would write the same file."""
     sources = expanded(options.paths)
     ignores_case = sys.platform in ("darwin", "win32")
     named: dict[str, Path] = {}
@@ -262,15 +260,12 @@ def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
                 f"two scenes must not have the same name in {options.folder}, found "
                 f"{before} and {source}."
             )
-        own = {"input": source, "output": options.folder / name}
-        job = argparse.Namespace(**{**vars(options), **own})
-        jobs.append(SceneJob(options=job, is_one_of_many=True))
+        jobs.append(_with_paths(options, source, options.folder / name))
     for one in jobs:
-        source, target = one.options.input, one.options.output
         for other in [*sources, *getattr(options, "merge", ())]:
-            if other != source and is_same_file(target, other):
+            if other != one.input and is_same_file(one.output, other):
                 raise InvalidArgumentError(
-                    f"the output of {source} must not replace another input, found {target}."
+                    f"the output of {one.input} must not replace another input, found {one.output}."
                 )
     make_output_folder(options)
     return jobs

@@ -26,14 +26,7 @@ from cvtgs.cli.goals import (
     search_target,
     with_limited_bands,
 )
-from cvtgs.cli.jobs import (
-    Outcome,
-    SceneJob,
-    add_paths,
-    make_output_folder,
-    open_jobs,
-    run_jobs,
-)
+from cvtgs.cli.jobs import Outcome, add_paths, make_output_folder, open_jobs, run_jobs
 from cvtgs.cli.options import (
     CAMERA_FILES,
     AddParser,
@@ -160,24 +153,26 @@ def simplify(options: argparse.Namespace) -> None:
     config = read_config(options, settings)
     with open_jobs(options) as jobs:
         for job in jobs:
-            check_written_files(job.options)
-            cvtgs.io.check_save(job.options.output, overwrite=options.overwrite)
+            check_written_files(job)
+            cvtgs.io.check_save(job.output, overwrite=options.overwrite)
         if options.report is not None:
             cvtgs.io.check_output(options.report, overwrite=options.overwrite)
         entries: list[dict[str, Any]] = []  # of many scenes
 
-        def keep(job: SceneJob, *, error: str | None = None, report: object = None) -> None:
-            paths = {"input": str(job.options.input), "output": str(job.options.output)}
+        def keep(
+            job: argparse.Namespace, *, error: str | None = None, report: object = None
+        ) -> None:
+            paths = {"input": str(job.input), "output": str(job.output)}
             entries.append({**paths, "error": error, "report": report})
 
-        def work(job: SceneJob) -> Outcome:
+        def work(job: argparse.Namespace) -> Outcome:
             outcome, report = _simplify_one(job, config, settings)
             for other in jobs:
-                other.options.recalibrate = False  # once is enough
-            if job.is_one_of_many:
-                keep(job, report=json.loads(report.to_json()))
+                other.recalibrate = False  # once is enough
+            if job.folder is None:
+                _write_report(options, report.to_json(), f"the scene {job.output} was")
             else:
-                _write_report(options, report.to_json(), f"the scene {job.options.output} was")
+                keep(job, report=json.loads(report.to_json()))
             return outcome
 
         try:
@@ -200,12 +195,12 @@ def _write_report(options: argparse.Namespace, text: str, written: str) -> None:
 
 
 def _simplify_one(
-    job: SceneJob, config: "cvtgs.SimplifyConfig", settings: Mapping[str, str]
+    options: argparse.Namespace, config: "cvtgs.SimplifyConfig", settings: Mapping[str, str]
 ) -> "tuple[Outcome, cvtgs.SimplifyReport]":
     """Simplify one scene, in memory or block by block; return the result to print and report."""
-    options, notes = job.options, list[str]()
-    options.begun = time.perf_counter() if job.is_one_of_many else STARTED
-    with progress_bars(quiet=options.quiet, transient=job.is_one_of_many) as listener:
+    notes, is_one_of_many = list[str](), options.folder is not None
+    options.begun = time.perf_counter() if is_one_of_many else STARTED
+    with progress_bars(quiet=options.quiet, transient=is_one_of_many) as listener:
         memory = block_memory(options, config)
         if memory is not None:
             report = simplify_blocks(options, config, memory, listener)
@@ -221,7 +216,7 @@ def _simplify_one(
                 f"--set {' '.join(unused)} had no effect: {used.preset} uses no such images."
             )
     searched = has_target(options)
-    if not job.is_one_of_many and report.stages:
+    if not is_one_of_many and report.stages:
         seconds = (f"{stage.stage}{TIE}{stage.seconds:.2f}" for stage in report.stages)
         of_what = " of all tries" if searched else ""
         notes.insert(0, f"Seconds{of_what}: {', '.join(seconds)}.")

@@ -122,9 +122,7 @@ def read_transform(options: argparse.Namespace) -> tuple[float, ...] | None:
 
 
 def stream_blocks(
-    options: argparse.Namespace,
-    config: "cvtgs.SimplifyConfig",
-    rhos: Sequence[float],
+    options: argparse.Namespace, config: "cvtgs.SimplifyConfig", rhos: Sequence[float]
 ) -> bool:
     """Write a stream in blocks if the scene does not fit into memory; return whether it did."""
     from cvtgs.grouping import finer_count
@@ -192,9 +190,7 @@ def of_different_sizes(rhos: Sequence[float], total: int, valid: int) -> list[fl
 
 
 def stream_levels(
-    options: argparse.Namespace,
-    made: "Sequence[cvtgs.Level]",
-    listener: "cvtgs.ProgressListener",
+    options: argparse.Namespace, made: "Sequence[cvtgs.Level]", listener: "cvtgs.ProgressListener"
 ) -> None:
     """Write levels that are in memory as a stream, and print its contents."""
     from cvtgs.outofcore.job import remove_job_files
