@@ -11,7 +11,7 @@ import numpy as np
 
 from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.rendering.compiled import Array, Ints, PixelBox, TileArrays, parallel, prange, serial
-from cvtgs.rendering.kernels_tiles import LOG_MIN_ALPHA, box_of, span, tile_at
+from cvtgs.rendering.kernels_tiles import box_of, columns_of, rows_of, span, tile_at
 from cvtgs.rendering.projection import MAX_ALPHA, MIN_TRANSMITTANCE
 
 WIDEST = 1e9  # half widths of splats beyond this, in pixels, count as this
@@ -83,29 +83,21 @@ def blend(
 ) -> tuple[int, float]:
     """Blend a splat into a tile; return the number of pixels finished, and its summed weight."""
     (layers, open_rows), finished, total = state, 0, 0.0
-    x0, x1, y0, y1 = box
+    x0, y0 = box[0], box[2]
     one, least = centers.dtype.type(1), centers.dtype.type(MIN_TRANSMITTANCE)
     faintest, most = centers.dtype.type(MIN_ALPHA), centers.dtype.type(MAX_ALPHA)
-    zero, lowest = centers.dtype.type(0), centers.dtype.type(LOG_MIN_ALPHA)  # float64 is slower
-    square, shear, rest, log_opacity = splat[2], splat[3], splat[4], splat[5]
-    room = min(zero, lowest - log_opacity)
-    half = math.sqrt(room / rest)
-    top, bottom = span(splat[1] - half, splat[1] + half, y0, y1)
+    top, bottom, room = rows_of(splat, box)
     columns = reached_columns(splat, room, box)
     for y in range(top, bottom):
         is_open = open_rows[y - y0]
         if is_open & columns == 0:
             continue
-        down = centers[y] - splat[1]
-        middle = splat[0] - shear * down
-        exponent = log_opacity + rest * down * down
-        half = math.sqrt(max(zero, (lowest - exponent) / square))
-        first, end = span(middle - half, middle + half, x0, x1)
+        first, end, middle, exponent = columns_of(splat, box, centers[y] - splat[1])
         for x in range(first, end):
             if (is_open >> (x - x0)) & 1 == 0:
                 continue
             along = centers[x] - middle
-            alpha = min(most, math.exp(exponent + square * along * along))
+            alpha = min(most, math.exp(exponent + splat[2] * along * along))
             if alpha < faintest:
                 continue
             pixel = layers[y - y0, x - x0]
@@ -202,21 +194,15 @@ def blend_gradient(
     """
     finished = 0
     transmittance, behind, open_rows = state
-    x0, x1, y0, y1 = box
-    zero, lowest = centers.dtype.type(0), centers.dtype.type(LOG_MIN_ALPHA)
-    square, shear, rest, log_opacity = splat[2], splat[3], splat[4], splat[5]
-    room = min(zero, lowest - log_opacity)
-    half = math.sqrt(room / rest)
-    top, bottom = span(splat[1] - half, splat[1] + half, y0, y1)
+    x0, y0 = box[0], box[2]
+    square, shear, rest = splat[2], splat[3], splat[4]
+    top, bottom, room = rows_of(splat, box)
     columns = reached_columns(splat, room, box)
     for y in range(top, bottom):
         if open_rows[y - y0] & columns == 0:
             continue
         down = centers[y] - splat[1]
-        middle = splat[0] - shear * down
-        exponent = log_opacity + rest * down * down
-        half = math.sqrt(max(zero, (lowest - exponent) / square))
-        first, end = span(middle - half, middle + half, x0, x1)
+        first, end, middle, exponent = columns_of(splat, box, down)
         row = (
             transmittance[y - y0, first - x0 :],
             behind[y - y0, first - x0 :],
@@ -228,7 +214,7 @@ def blend_gradient(
         if done:
             finished += done
             for x in range(first, end):
-                if transmittance[y - y0, x - x0] == zero:
+                if transmittance[y - y0, x - x0] == 0:
                     open_rows[y - y0] &= ~(np.int64(1) << (x - x0))
         out[0] -= 2 * square * moment
         out[1] -= 2 * (square * shear * moment + rest * down * zeroth)

@@ -117,6 +117,27 @@ def span(low: float, high: float, begin: int, end: int) -> tuple[int, int]:
 
 
 @serial
+def rows_of(splat: Array, box: PixelBox) -> tuple[int, int, float]:
+    """Return the rows of a tile that a splat reaches, and the exponent of alpha at its edge."""
+    zero, lowest = splat.dtype.type(0), splat.dtype.type(LOG_MIN_ALPHA)  # float64 is slower
+    room = min(zero, lowest - splat[5])
+    half = math.sqrt(room / splat[4])
+    top, bottom = span(splat[1] - half, splat[1] + half, box[2], box[3])
+    return top, bottom, room
+
+
+@serial
+def columns_of(splat: Array, box: PixelBox, down: float) -> tuple[int, int, float, float]:
+    """Return the columns that a splat reaches in a row, and the x and log alpha of its peak."""
+    zero, lowest = splat.dtype.type(0), splat.dtype.type(LOG_MIN_ALPHA)
+    middle = splat[0] - splat[3] * down
+    exponent = splat[5] + splat[4] * down * down
+    half = math.sqrt(max(zero, (lowest - exponent) / splat[2]))
+    first, end = span(middle - half, middle + half, box[0], box[1])
+    return first, end, middle, exponent
+
+
+@serial
 def tile_at(step: int, count: int) -> int:
     """Return the tile of a step; each tile occurs once."""
     number = np.int64(step)  # numba counts parallel loops in uint64, which % turns into floats

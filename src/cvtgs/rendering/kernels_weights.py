@@ -21,7 +21,7 @@ from cvtgs.rendering.compiled import (
     prange,
     serial,
 )
-from cvtgs.rendering.kernels_tiles import LOG_MIN_ALPHA, box_of, span, tile_at
+from cvtgs.rendering.kernels_tiles import box_of, columns_of, rows_of, tile_at
 from cvtgs.rendering.projection import MAX_ALPHA, MIN_TRANSMITTANCE
 
 
@@ -32,23 +32,6 @@ class WeightArrays(NamedTuple):
     counts: Ints  # (p,) number of weights of each intersection
     pixels: NDArray[np.uint8]  # index of the weight's pixel within its tile
     values: NDArray[np.float32]
-
-
-@serial
-def rows_of(splat: Array, box: PixelBox) -> tuple[int, int]:
-    """Return the range of pixel rows of a tile that a splat reaches."""
-    half = math.sqrt(max(0.0, (LOG_MIN_ALPHA - splat[5]) / splat[4]))
-    return span(splat[1] - half, splat[1] + half, box[2], box[3])
-
-
-@serial
-def columns_of(splat: Array, box: PixelBox, down: float) -> tuple[int, int, float, float]:
-    """Return the columns that a splat reaches in a row, and the x and log alpha of its peak."""
-    middle = splat[0] - splat[3] * down
-    exponent = splat[5] + splat[4] * down * down
-    half = math.sqrt(max(0.0, (LOG_MIN_ALPHA - exponent) / splat[2]))
-    first, end = span(middle - half, middle + half, box[0], box[1])
-    return first, end, middle, exponent
 
 
 @parallel
@@ -62,7 +45,7 @@ def count_pixels(
         box = box_of(tile, side, size)
         for entry in range(starts[tile], starts[tile + 1]):
             splat = packed[lists[entry, 1]]
-            top, bottom = rows_of(splat, box)
+            top, bottom, _ = rows_of(splat, box)
             count = 0
             for y in range(top, bottom):
                 first, end, _, _ = columns_of(splat, box, centers[y] - splat[1])
@@ -115,7 +98,7 @@ def blend_weights(
     one, least = centers.dtype.type(1), centers.dtype.type(MIN_TRANSMITTANCE)
     faintest, most = centers.dtype.type(MIN_ALPHA), centers.dtype.type(MAX_ALPHA)
     pixels, values = out
-    top, bottom = rows_of(splat, box)
+    top, bottom, _ = rows_of(splat, box)
     for y in range(top, bottom):
         first, end, middle, exponent = columns_of(splat, box, centers[y] - splat[1])
         for x in range(first, end):
