@@ -195,25 +195,14 @@ def find_count(
             f"no simplified scene reaches {wanted}: the best one tried, with {nearest.count:,} of "
             f"{total:,} Gaussians, reaches {reached}."
         )
-    stages = tuple(join_costs([*costs, *clock.costs]))
-    return _found(*best, target=target, tried=tuple(tried), stages=stages)
-
-
-def _found(
-    simplified: Simplified,
-    quality: Tried,
-    *,
-    target: Target,
-    tried: tuple[Tried, ...],
-    stages: tuple[StageCost, ...],
-) -> Found:
-    """Join the best scene, its scores, and a report of the whole search."""
-    scores = quality.model_dump(exclude={"count"})
+    (small, report), quality = best
     search = SearchReport(
-        metric=target.metric, target=target.value, tried=tried, count=quality.count, **scores
+        metric=target.metric, target=target.value, tried=tuple(tried), **quality.model_dump()
     )
-    report = simplified.report.model_copy(update={"search": search, "stages": stages})
-    return Found(simplified.scene, report, tried=tried, **scores)
+    stages = tuple(join_costs([*costs, *clock.costs]))
+    report = report.model_copy(update={"search": search, "stages": stages})
+    scores = quality.model_dump(exclude={"count"})
+    return Found(small, report, tried=search.tried, **scores)
 
 
 def heldout_scorer(full: GaussianScene, cameras: Cameras, *, listener: ProgressListener) -> Scorer:
