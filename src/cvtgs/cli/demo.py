@@ -11,6 +11,7 @@ from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped
 from cvtgs.cli.options import AddParser, add_options, count
 from cvtgs.cli.paths import new_folder
 from cvtgs.errors import OutputExistsError
+from cvtgs.io.atomic import make_folder
 from cvtgs.text import size_text
 
 FULL, SMALL = "full.ply", {"small_0.1.ply": 0.1, "small_0.01.ply": 0.01}  # ratios
@@ -57,8 +58,6 @@ def add_demo(add_parser: AddParser) -> None:
 
 def demo(options: argparse.Namespace) -> None:
     """Run ``cvtgs demo``."""
-    from cvtgs.io.atomic import make_folder
-
     make_folder(options.output)
     _check_folder(options.output)
     columns, sizes, smaller = list[dict[str, str]](), dict[str, int](), {}

@@ -9,6 +9,7 @@ from typing import TextIO
 
 import cvtgs
 from cvtgs.errors import OutputError, reason_of
+from cvtgs.io.streams import copy_to
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.text import columns, counted, printable
 
@@ -32,8 +33,6 @@ def flush_output() -> None:
 
 def send_file(path: Path) -> None:
     """Write the bytes of a file to stdout."""
-    from cvtgs.io.streams import copy_to
-
     with path.open("rb") as file, _console_errors(sys.stdout):
         copy_to(sys.stdout.buffer, file)
         sys.stdout.buffer.flush()

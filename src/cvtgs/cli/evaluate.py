@@ -19,7 +19,7 @@ from cvtgs.cli.jobs import expanded
 from cvtgs.cli.options import CAMERA_FILES, AddParser, add_options, read_words
 from cvtgs.cli.view import PAGE, check_page, write_page
 from cvtgs.errors import InvalidArgumentError, RunError, warn
-from cvtgs.io.atomic import windows_fault, write_atomically
+from cvtgs.io.atomic import make_folder, windows_fault, write_atomically
 from cvtgs.progress import ProgressEvent
 from cvtgs.text import MOST_LETTERS, counted, printable_name, size_text
 
@@ -45,7 +45,6 @@ def render(options: argparse.Namespace) -> None:
 
     from cvtgs.devices import chosen_device
     from cvtgs.evaluation.images import as_bytes, encode
-    from cvtgs.io.atomic import make_folder
     from cvtgs.rendering.render import LEAST_COVER
 
     settings = evaluation_settings(options)

@@ -80,17 +80,15 @@ Edit = Callable[["cvtgs.GaussianScene"], "cvtgs.GaussianScene"]
 
 def read_edits(options: argparse.Namespace) -> list[tuple[str, Edit]]:
     """Read the edits in their order, each after words for the Gaussians that it drops."""
-    from cvtgs.boxes import Box, Sphere
-    from cvtgs.edit import Motion
-
-    edit, edits, regions = cvtgs.edit, list[tuple[str, Edit]](), list[Box | Sphere]()
+    edit, edits, boxes = cvtgs.edit, list[tuple[str, Edit]](), cvtgs.boxes
+    regions = list[boxes.Box | boxes.Sphere]()
     for text in options.crop_box:
         of = "x,y,z,X,Y,Z, the minimum and maximum coordinates"
         x0, y0, z0, x1, y1, z1 = read_numbers("--crop-box", text, 6, of=of)
-        regions.append(Box(min=(x0, y0, z0), max=(x1, y1, z1)))
+        regions.append(boxes.Box(min=(x0, y0, z0), max=(x1, y1, z1)))
     for text in options.crop_sphere:
         x, y, z, radius = read_numbers("--crop-sphere", text, 4, of="x,y,z,r, centre and radius")
-        regions.append(Sphere(center=(x, y, z), radius=radius))
+        regions.append(boxes.Sphere(center=(x, y, z), radius=radius))
     if regions:
         given = {"--crop-box": options.crop_box, "--crop-sphere": options.crop_sphere}
         words = f"outside {' and '.join(name for name, texts in given.items() if texts)}"
@@ -111,7 +109,7 @@ def read_edits(options: argparse.Namespace) -> list[tuple[str, Edit]]:
             a, b, c = read_numbers("--rotate", options.rotate, 3, of=of)
         if options.translate is not None:
             x, y, z = read_numbers("--translate", options.translate, 3, of="x,y,z")
-        motion = Motion.of_angles((a, b, c), scale=scale, shift=(x, y, z))
+        motion = edit.Motion.of_angles((a, b, c), scale=scale, shift=(x, y, z))
         edits.append(("moved", lambda scene: edit.move(scene, motion)))
     return edits
 

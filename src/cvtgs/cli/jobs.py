@@ -23,6 +23,8 @@ from cvtgs.errors import (
     OutputError,
     RunError,
 )
+from cvtgs.io.atomic import make_folder
+from cvtgs.io.streams import file_of, named_in_warnings
 from cvtgs.text import counted, printable_name, shortened, shown, size_text
 
 STREAM = "-"  # the path that stands for standard input or output
@@ -109,8 +111,6 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[argparse.Namespace]]
     With ``to_stream``, the output is copied to standard output. Standard streams are temporary
     files within the context.
     """
-    from cvtgs.io.streams import named_in_warnings
-
     check_suffix(options.suffix)
     if options.folder is not None:
         yield _folder_jobs(options)
@@ -152,8 +152,6 @@ def input_file(source: str | Path) -> Iterator[Path]:
     if str(source) != STREAM:
         yield Path(source)
         return
-    from cvtgs.io.streams import file_of
-
     if sys.stdin is None or sys.stdin.isatty():
         found = "none" if sys.stdin is None else "a terminal"
         raise InputError(f"standard input must be a pipe or a file, found {found}.")
@@ -273,8 +271,6 @@ def _folder_jobs(options: argparse.Namespace) -> list[argparse.Namespace]:
 
 def make_output_folder(options: argparse.Namespace) -> None:
     """Make the folder of ``-o`` unless it is there; a failed run removes one that it made."""
-    from cvtgs.io.atomic import make_folder
-
     if options.folder is not None:
         make_folder(options.folder)
 

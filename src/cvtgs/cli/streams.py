@@ -17,6 +17,7 @@ from cvtgs.cli.blocks import (
 from cvtgs.cli.display import progress_bars, say, say_table, say_wrapped, shortfall_note
 from cvtgs.cli.options import checkpoint_of, read_numbers
 from cvtgs.errors import ConfigError, FileFormatError, InputError, InvalidArgumentError
+from cvtgs.io.atomic import make_folder
 from cvtgs.text import size_text
 
 STREAMS = ("sog", "3dtiles")
@@ -70,7 +71,6 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
 
 def check_stream_options(options: argparse.Namespace) -> None:
     """Check the options of streams before the long work starts."""
-    from cvtgs.io.atomic import make_folder
     from cvtgs.streams.files import check_stream
 
     scoring = [name for name, default in OF_SCORES.items() if getattr(options, name) != default]

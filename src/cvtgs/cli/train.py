@@ -64,8 +64,6 @@ def add_train(add_parser: AddParser) -> None:
 
 def train(options: argparse.Namespace) -> None:
     """Run ``cvtgs train``."""
-    from cvtgs.devices import chosen_device
-
     config = cvtgs.train.TrainConfig.from_toml(options.config)
     data = config.data.model_copy(
         update={
@@ -83,7 +81,7 @@ def train(options: argparse.Namespace) -> None:
             files,
             resume=options.resume,
             overwrite=options.overwrite,
-            device=chosen_device(options.device),
+            device=options.device,
             listener=listener,
             on_validation=lambda history: None if options.quiet else print_validation(history),
         )
