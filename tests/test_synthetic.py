@@ -188,14 +188,14 @@ def test_up_is_negative_y():
     ("arguments", "text"),
     [
         ({"kind": "cave"}, "kind must be one of object, room, .*, found 'cave'"),
-        ({"count": 0}, "count must be a whole number from 1 to .*, found 0"),
-        ({"sh_degree": 4}, "sh_degree must be a whole number from 0 to 3, found 4"),
-        ({"seed": -1}, "seed must be a whole number from 0 to .*, found -1"),
+        ({"count": 0}, "count must be a whole number between 1 and .*, found 0"),
+        ({"sh_degree": 4}, "sh_degree must be a whole number between 0 and 3, found 4"),
+        ({"seed": -1}, "seed must be a whole number between 0 and .*, found -1"),
         ({"kind": ["room"]}, r"kind must be one of .*, found \['room'\]"),
-        ({"count": "10"}, "count must be a whole number from .*, found '10'"),
-        ({"count": 1.5}, "count must be a whole number from .*, found 1.5"),
-        ({"sh_degree": "1"}, "sh_degree must be a whole number from .*, found '1'"),
-        ({"seed": 1.5}, "seed must be a whole number from .*, found 1.5"),
+        ({"count": "10"}, "count must be a whole number between .*, found '10'"),
+        ({"count": 1.5}, "count must be a whole number between .*, found 1.5"),
+        ({"sh_degree": "1"}, "sh_degree must be a whole number between .*, found '1'"),
+        ({"seed": 1.5}, "seed must be a whole number between .*, found 1.5"),
     ],
 )
 def test_bad_arguments_are_refused(arguments, text):

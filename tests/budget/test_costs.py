@@ -153,8 +153,14 @@ def test_cost_models_of_other_values_are_refused(values, text):
         ({"count": -1}, "count must be a whole number above 0, found -1."),
         ({"count": 1.5}, "count must be a whole number above 0, found 1.5."),
         ({"count": "a"}, "count must be a whole number above 0, found 'a'."),
-        ({"target": 11}, "target must be a whole number from 1 to the count, 10; found 11."),
-        ({"target": 0}, "target must be a whole number from 1 to the count, 10; found 0."),
+        (
+            {"target": 11},
+            "target must be a whole number between 1 and the 10 Gaussians of the input, found 11.",
+        ),
+        (
+            {"target": 0},
+            "target must be a whole number between 1 and the 10 Gaussians of the input, found 0.",
+        ),
         ({"colors": 0}, "colors must be 3, 12, 27 or 48, found 0."),
     ],
 )

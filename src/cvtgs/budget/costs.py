@@ -62,11 +62,7 @@ class Work:
 
     def __post_init__(self) -> None:
         checked_whole(self.count, "count")
-        if not 1 <= whole_number(self.target) <= self.count:
-            raise InvalidArgumentError(
-                f"target must be a whole number from 1 to the count, {self.count:,}; "
-                f"found {shown(self.target)}."
-            )
+        checked_whole(self.target, "target", most=self.count, things="Gaussians of the input")
         if whole_number(self.colors) not in COLORS:
             raise InvalidArgumentError(
                 f"colors must be 3, 12, 27 or 48, found {shown(self.colors)}."

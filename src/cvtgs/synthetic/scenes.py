@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from cvtgs.counts import whole_number
+from cvtgs.counts import checked_whole
 from cvtgs.devices import full_precision, in_float32, one_thread
 from cvtgs.errors import InvalidArgumentError, memory_errors
 from cvtgs.math.spherical_harmonics import REST_COUNTS
@@ -49,16 +49,9 @@ def scene(kind: str, count: int, *, sh_degree: int = 3, seed: int = 0) -> Gaussi
     """
     if kind not in KINDS:
         raise InvalidArgumentError(f"kind must be one of {', '.join(KINDS)}, found {shown(kind)}.")
-    for name, value, low, high in (
-        ("count", count, 1, 2**40),
-        ("sh_degree", sh_degree, 0, 3),
-        ("seed", seed, 0, 2**63 - 1),
-    ):
-        if not low <= whole_number(value) <= high:
-            raise InvalidArgumentError(
-                f"{name} must be a whole number from {low} to {high}, found {shown(value)}."
-            )
-    count, sh_degree, seed = map(whole_number, (count, sh_degree, seed))
+    count = checked_whole(count, "count", most=2**40)
+    sh_degree = checked_whole(sh_degree, "sh_degree", least=0, most=3)
+    seed = checked_whole(seed, "seed", least=0, most=2**63 - 1)
     with (
         memory_errors(f"a scene of {count:,} Gaussians", "make a smaller one"),
         in_float32(),
