@@ -46,6 +46,7 @@ class BlendingWeights(Protocol):
 
     def normal(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Return ``collect(paint(colors))``."""
+        return self.collect(self.paint(colors))
 
     def powers(self) -> Float[Tensor, "n 2"]:
         """Return, for every Gaussian, the sum of its weights and of their squares."""
@@ -213,7 +214,7 @@ def observe_in_two_passes(
         yield rasterize(scene, camera, sh_degree=sh_degree), sums
 
 
-class PixelWeights:
+class PixelWeights(BlendingWeights):
     """The weights of one image; 24 bytes per pair of splat and pixel, twice that in products."""
 
     def __init__(
@@ -243,10 +244,6 @@ class PixelWeights:
         check_image(image, self._size)
         flat = image.reshape(-1, 3).to(self._weights.dtype)
         return segments.segment_sum_of(flat, self._pixels, self._row_starts, self._weights)
-
-    def normal(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Return ``collect(paint(colors))``."""
-        return self.collect(self.paint(colors))
 
     def powers(self) -> Float[Tensor, "n 2"]:
         """Return, for every Gaussian, the sum of its weights and of their squares."""

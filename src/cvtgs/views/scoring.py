@@ -107,7 +107,7 @@ def measure_splats(
 ) -> SplatSizes:
     """Return the sizes of the splats that cameras show; ``widths`` need not be as drawn."""
     starts = range(0, len(cameras), _TOGETHER)
-    parts = [cameras.select(range(len(cameras))[start : start + _TOGETHER]) for start in starts]
+    parts = (cameras[start : start + _TOGETHER] for start in starts)
     found = torch.cat([_splat_quantiles(scene, widths, part) for part in parts])
     share_of_image = cameras.Ks[:, 0, 0].double().cpu() / max(cameras.width, cameras.height)
     in_image, in_scene, finest = found.unbind(1)
