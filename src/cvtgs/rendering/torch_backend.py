@@ -152,12 +152,11 @@ def intersect(splats: Splats, size: tuple[int, int], side: int) -> TileLists:
     strip, place = _expand(counts)
     tiles = (row[strip] * across + first[strip] + place).to(torch.int32)
     owner = splat[strip]
-    sorted_tiles, ranks = torch.sort(tiles, stable=True)
-    per_tile = torch.bincount(sorted_tiles, minlength=across * down)
+    ranks, starts = segments.sort_by_label(tiles, across * down)
     per_splat = torch.bincount(owner, minlength=len(splats.rows))
     return TileLists(
         splats=owner[ranks],
-        starts=torch.nn.functional.pad(per_tile.cumsum(0), (1, 0)),
+        starts=starts,
         ranks=ranks,
         splat_starts=torch.nn.functional.pad(per_splat.cumsum(0), (1, 0)),
         side=side,
