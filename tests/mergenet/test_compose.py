@@ -179,6 +179,30 @@ class Watch(TorchDispatchMode):
         return result
 
 
+class Whole(TorchDispatchMode):
+    """Collect the operations that make new tensors of a shape, which are no views."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        super().__init__()
+        self.shape, self.made = shape, list[str]()
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        result, name = function(*args, **(kwargs or {})), function.overloadpacket.__name__
+        if isinstance(result, torch.Tensor) and tuple(result.shape) == self.shape:
+            shared = [value.data_ptr() for value in args if isinstance(value, torch.Tensor)]
+            self.made += [name] * (result.data_ptr() not in shared)
+        return result
+
+
+def test_only_one_copy_of_all_cells_is_made(monkeypatch):
+    """With most Gaussians kept, a copy of the merged ones takes much of the memory of a run."""
+    monkeypatch.setattr("cvtgs.mergenet.apply.CHUNK_MEMBERS", 64)
+    case, net = some_case(300, 120, degree=3), lively_net()
+    with one_thread(), Whole((120, 15, 3)) as watch:
+        case.correct(net)
+    assert watch.made == ["clone"]
+
+
 @pytest.mark.parametrize(("degree", "bands"), [(0, 0), (1, 3), (3, 15)])
 def test_bands_of_zero_width_are_only_copied(degree, bands):
     case, net = some_case(degree=degree), lively_net()

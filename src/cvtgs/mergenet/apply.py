@@ -109,17 +109,14 @@ def correct_cells(  # noqa: PLR0913 (options by name)
         )
     with torch.no_grad(), closing(corrections):  # an error in `on_cells` ends their threads
         for rows, corrected in corrections:
+            # Near the limits of the dtype (a flyaway at 3e38) a correction may overflow.
+            flat = [corrected[name].reshape(len(rows), -1) for name in tensors]
+            finite = torch.stack([values.isfinite().all(dim=1) for values in flat]).all(dim=0)
             for name, values in tensors.items():
-                values[rows] = corrected[name]
+                is_used = finite.view(-1, *[1] * (values.dim() - 1))
+                values[rows] = torch.where(is_used, corrected[name], originals[name][rows])
             done += len(rows)
             on_cells(done)
-    # Near the limits of the dtype (a flyaway at 3e38) a correction may overflow.
-    flat = [values.reshape(len(values), -1) for values in tensors.values()]
-    finite = torch.stack([values.isfinite().all(dim=1) for values in flat]).all(dim=0)
-    tensors = {
-        name: torch.where(finite.view(-1, *[1] * (values.dim() - 1)), values, originals[name])
-        for name, values in tensors.items()
-    }
     return merged.with_tensors(tensors)
 
 
