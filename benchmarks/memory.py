@@ -9,9 +9,8 @@ from pathlib import Path
 
 from benchmarks.measuring import generated_scenes, machine, run_python
 from cvtgs import SimplifyConfig, target_count
-from cvtgs.grouping import finer_count
 from cvtgs.io.ply import open_rows
-from cvtgs.outofcore.memory import needed_memory
+from cvtgs.outofcore.memory import merging_rows, needed_memory
 
 SCENES = (
     ("courtyard", 1_000_000, 0),
@@ -41,7 +40,7 @@ def main() -> None:
 def measured(file: Path, rho: float, folder: Path) -> str:
     """Return the peak of one simplification, and its estimate."""
     rows, allocation = open_rows(file), SimplifyConfig().allocation
-    merging = finer_count(target_count(rows.count, rho), rows.count, allocation)
+    merging = merging_rows(target_count(rows.count, rho), rows.count, allocation)
     estimate = needed_memory(rows, rows.count, merging=merging)
     command = ["-m", "cvtgs", "simplify", str(file), str(folder / "small.ply"), "--overwrite"]
     cost = run_python(*command, "--rho", str(rho), "--quiet", "--memory", "1TB")

@@ -142,8 +142,7 @@ def block_memory(options: argparse.Namespace, config: "cvtgs.SimplifyConfig") ->
 
 def needs_blocks(options: argparse.Namespace, memory: int, config: "cvtgs.SimplifyConfig") -> bool:
     """Return whether a file does not fit; only binary PLYs can be read in parts, and simplified."""
-    from cvtgs.grouping import finer_count
-    from cvtgs.outofcore.memory import IMAGE_BYTES, block_count
+    from cvtgs.outofcore.memory import IMAGE_BYTES, block_count, merging_rows
 
     rows = rows_of(options.input)
     if rows is None:
@@ -157,7 +156,7 @@ def needs_blocks(options: argparse.Namespace, memory: int, config: "cvtgs.Simpli
             return False
     if config.uses_images or has_target(options):
         memory -= IMAGE_BYTES
-    merging = finer_count(target, rows.count, config.allocation)
+    merging = merging_rows(target, rows.count, config.allocation)
     return block_count(rows, memory, merging=merging) > 1
 
 

@@ -125,10 +125,9 @@ def stream_blocks(
     options: argparse.Namespace, config: "cvtgs.SimplifyConfig", rhos: Sequence[float]
 ) -> bool:
     """Write a stream in blocks if the scene does not fit into memory; return whether it did."""
-    from cvtgs.grouping import finer_count
     from cvtgs.io.axes import SCENE_AXES
     from cvtgs.io.ply import open_rows
-    from cvtgs.outofcore.memory import IMAGE_BYTES, block_count, check_memory
+    from cvtgs.outofcore.memory import IMAGE_BYTES, block_count, check_memory, merging_in_levels
     from cvtgs.outofcore.run import check_config
     from cvtgs.streams import stream_file
     from cvtgs.streams.plan import CHUNK_GAUSSIANS
@@ -137,13 +136,11 @@ def stream_blocks(
     try:
         if options.scheduler is None:
             rows = open_rows(options.input)
-            targets = {cvtgs.target_count(rows.count, rho) for rho in rhos}
-            finest = max(targets - {rows.count}, default=rows.count)  # a whole level merges nothing
-            merging = finer_count(finest, rows.count, config.allocation)
+            targets = [cvtgs.target_count(rows.count, rho) for rho in rhos]
+            merging = merging_in_levels(targets, rows, config.allocation)
             check_memory(memory if asked else None, with_images=config.uses_images)
             room = memory - IMAGE_BYTES if config.uses_images else memory
-            # Levels one after the other need a little more memory than the finest alone.
-            if block_count(rows, room, merging=merging + merging // 4) == 1:
+            if block_count(rows, room, merging=merging) == 1:
                 return False
         check_block_device(options)
         check_config(config, with_images=False)

@@ -20,7 +20,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
-from cvtgs.errors import CvtgsError, InputError, OutputError, reason_of, warn
+from cvtgs.errors import CvtgsError, InputError, OutputError, reason_of
 from cvtgs.io.atomic import write_atomically
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.files import is_file, is_folder
@@ -28,15 +28,12 @@ from cvtgs.io.locks import hidden_path, lock_path, output_lock
 from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.mergenet import Checkpoint, Net, encode_checkpoint, load_checkpoint
-from cvtgs.outofcore.memory import CELL_ROOM
+from cvtgs.outofcore.memory import CELL_ROOM, joint_cells, step_bytes, warn_of_full_disk
 from cvtgs.outofcore.scan import SAMPLE_ROWS, SceneScan, read_scan, write_scan
 from cvtgs.processes import Workers
-from cvtgs.text import size_text
 
 SENT_BYTES = "sent_bytes"  # entry of the label file of a block: bytes of the file of its sent rows
 
-
-EXTRA_BYTES = 12  # of the files of blocks for each Gaussian, beyond those of the source
 
 FILES_VERSION = 11
 """Number of the layout of these files: raise it with every change, so that no run continues with
@@ -110,6 +107,12 @@ class Job:
     def write_file(self, name: str, content: bytes) -> None:
         """Write a file of the job, completely or not at all."""
         write_atomically(self.path(name), content, overwrite=True)
+
+    @property
+    def file_bytes(self) -> int:
+        """Estimate of the bytes of all files of the job, when they take most, and of the output."""
+        cells = joint_cells(self.target, self.source.count, self.cell_room, self.config.allocation)
+        return step_bytes(self.source, cells=cells, kept=self.target)
 
     @property
     def views_path(self) -> Path:
@@ -308,7 +311,7 @@ def started(
             _make_empty(Path(job.folder))
             sizes = {name: getattr(job, name) for name in SIZES}
             job.write_file("sizes.json", json.dumps(sizes).encode())
-            _warn_of_full_disk(job)
+            warn_of_full_disk(job.folder, job.file_bytes)
         check: Callable[[Job], object] | None = getattr(workers, "check", None)
         if check is not None:  # workers on other machines
             with clock.stage("workers"):
@@ -338,19 +341,6 @@ def _make_empty(folder: Path) -> None:
             f"{folder.parent}: must be replaceable by an empty folder for block files, "
             f"found: {reason_of(error)}."
         ) from error
-
-
-def _warn_of_full_disk(job: Job) -> None:
-    """Warn if the files of the blocks will probably not fit on their disk."""
-    needed = job.source.count * (job.source.dtype.itemsize + EXTRA_BYTES)
-    with suppress(OSError):
-        free = shutil.disk_usage(job.folder).free
-        if free < needed:
-            warn(
-                f"{Path(job.folder).parent}: the files of the blocks take some "
-                f"{size_text(needed)}, but {size_text(free)} of the disk are free; write the "
-                f"output to a larger one."
-            )
 
 
 def _stamp(path: str) -> tuple[int, int] | None:

@@ -3,14 +3,19 @@
 import math
 import os
 import re
+import shutil
 import sys
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import torch
 
+from cvtgs.config import AllocationConfig
 from cvtgs.counts import checked_whole, whole_number
 from cvtgs.devices import core_count
 from cvtgs.errors import InvalidArgumentError, warn
+from cvtgs.grouping import finer_count
 from cvtgs.io.ply import PlyRows
 from cvtgs.outofcore.scan import SAMPLE_ROWS
 from cvtgs.processes import Workers, pool_size
@@ -32,6 +37,17 @@ CELL_BYTES = 1500
 components of view-dependent colour."""
 
 MERGING_BYTES = 230  # the same in one piece, beyond what rows take in other stages
+ORDER_BYTES = 256  # of each Gaussian, likewise, from the second of several levels on
+KEPT_BYTES = 500  # of each Gaussian that is kept, likewise, which counts where these are most
+# Bytes of files on disk, measured with 100,000 to a million Gaussians:
+SCAN_BYTES = 9_000_000  # the grid of depths
+ROW_BYTES = 12  # of each row beyond those of the source
+POINT_BYTES = 58  # of each row: its order, its cell, the sample of Lloyd, rows that are sent
+JOINT_BYTES = 380  # of each cell: sites, sums of their points, moments of parts
+GROUP_BYTES = 192  # of each Gaussian that is kept: moments and neighbours
+STREAM_PART = 6  # divides the bytes of a row: about what a Gaussian of a stream takes
+RESULTS = 4  # in rows of the source: merged, inflated, corrected and written
+
 WRITING_ROWS = 5  # in rows of the file: what a format takes that is written from memory
 CELL_ROOM = 1 << 20  # number of cells that may merge together if no memory is given
 SHARED_BY = 4  # divides the number of blocks, so that two or four workers end at the same time
@@ -93,7 +109,7 @@ def warn_of_writing(
 
 def memory_to_plan() -> int:
     """Return the default memory to plan with."""
-    # Estimates are twice the actual use, so planning with less would only give more blocks.
+    # Estimates are above the actual use, that of blocks about twice, so none of it is held back.
     return max(available_memory(), LEAST_BYTES)
 
 
@@ -160,6 +176,21 @@ def needed_memory(source: PlyRows, rows: int, *, merging: int = 0) -> int:
     return BASE_BYTES + rows * (290 + 2 * source.dtype.itemsize) + merging * MERGING_BYTES
 
 
+def merging_rows(target: int, available: int, config: AllocationConfig) -> int:
+    """Return how many cells or single Gaussians merge, and more if many Gaussians are kept."""
+    kept = math.ceil(target * KEPT_BYTES / MERGING_BYTES)
+    return max(finer_count(target, available, config), kept)
+
+
+def merging_in_levels(targets: Sequence[int], rows: PlyRows, config: AllocationConfig) -> int:
+    """Return the rows that take as much memory as merging, for levels one after the other."""
+    smaller = [target for target in set(targets) if target < rows.count]  # a whole one merges none
+    merging = merging_rows(max(smaller, default=rows.count), rows.count, config)
+    if len(smaller) > 1:  # from the second one on, the order and all moments are kept
+        return merging + math.ceil(rows.count * ORDER_BYTES / MERGING_BYTES)
+    return merging + merging // 4
+
+
 def cell_room(memory: int | None) -> int:
     """Return how many cells of the tessellation may merge together in this memory."""
     if memory is None:
@@ -177,6 +208,41 @@ def block_count(source: PlyRows, memory: int, *, merging: int = 0) -> int:
     wanted = needed_memory(source, source.count) - BASE_BYTES  # blocks have at most twice the mean
     room = (memory if memory > base else LEAST_BYTES) - base
     return SHARED_BY * math.ceil(2 * wanted / room / SHARED_BY)
+
+
+def joint_cells(kept: int, total: int, room: int, config: AllocationConfig) -> int:
+    """Return the number of cells of the tessellation of all blocks, which one process merges."""
+    finer = finer_count(kept, total, config)
+    if total > room:
+        finer = min(finer, max(room, 2 * kept), max(kept, total // 2))
+    return finer
+
+
+def sorted_bytes(source: PlyRows) -> int:
+    """Estimate the bytes of the files once all rows are sorted."""
+    return SCAN_BYTES + source.count * (source.dtype.itemsize + ROW_BYTES)
+
+
+def stream_bytes(source: PlyRows, gaussians: int) -> int:
+    """Estimate the bytes of the files of a stream of some Gaussians, before it is published."""
+    return sorted_bytes(source) + gaussians * source.dtype.itemsize // STREAM_PART
+
+
+def step_bytes(source: PlyRows, *, cells: int, kept: int) -> int:
+    """Estimate the bytes of the files of all steps; cells cross the borders of blocks."""
+    results = kept * (RESULTS * source.dtype.itemsize + GROUP_BYTES)
+    return sorted_bytes(source) + source.count * POINT_BYTES + cells * JOINT_BYTES + results
+
+
+def warn_of_full_disk(folder: str, needed: int) -> None:
+    """Warn if the files of the blocks will probably not fit on their disk."""
+    with suppress(OSError):
+        free = shutil.disk_usage(folder).free
+        if free < needed:
+            warn(
+                f"{Path(folder).parent}: the files of the blocks take some {size_text(needed)}, "
+                f"but {size_text(free)} of the disk are free; write the output to a larger one."
+            )
 
 
 def chosen_blocks(

@@ -18,7 +18,7 @@ from cvtgs.devices import HOST, full_precision, on_host, one_thread
 from cvtgs.edit import concatenate
 from cvtgs.errors import ConfigError, check_path, warn
 from cvtgs.evaluation.blind_views import check_seen
-from cvtgs.grouping import finer_count, most_cells
+from cvtgs.grouping import most_cells
 from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES, checked_axes
 from cvtgs.io.locks import output_lock
@@ -39,7 +39,9 @@ from cvtgs.outofcore.memory import (
     cell_room,
     check_memory,
     chosen_blocks,
+    joint_cells,
     memory_to_plan,
+    merging_rows,
     sample_rows,
     warn_of_writing,
 )
@@ -155,7 +157,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         room -= IMAGE_BYTES
         cameras = _cameras_to_fit(cameras, rows, source, axes=source_axes)
     allocation = simplifier.config.allocation
-    merging = finer_count(target, rows.count, allocation)
+    merging = merging_rows(target, rows.count, allocation)
     job = Job(
         folder="",
         source=rows,
@@ -234,9 +236,7 @@ def _scan_and_sort(job: Job, workers: Workers, clock: StageClock) -> Manifest:
     """Scan the file and sort its rows into blocks; return the manifest."""
     found = sort_into_blocks(job, workers, clock)
     total = sum(found.rows)
-    finer = finer_count(found.rest, total, job.config.allocation)
-    if total > job.cell_room:  # one process merges all cells
-        finer = min(finer, max(job.cell_room, 2 * found.rest), max(found.rest, total // 2))
+    finer = joint_cells(found.rest, total, job.cell_room, job.config.allocation)
     if finer < sum(1 for count in found.rows if count):  # the heaviest get one each
         order = sorted(range(job.blocks), key=lambda block: -found.cells[block])
         cells = [int(block in order[:finer]) for block in range(job.blocks)]

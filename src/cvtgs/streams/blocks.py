@@ -22,7 +22,7 @@ from cvtgs.counts import checked_whole, shared_out, target_count, written_ratios
 from cvtgs.devices import HOST, full_precision, on_host, one_thread
 from cvtgs.errors import InvalidArgumentError, check_path
 from cvtgs.filters import filter_rows
-from cvtgs.grouping import allocate, finer_count, order_rows, tessellate_rows, weigh_rows
+from cvtgs.grouping import allocate, order_rows, tessellate_rows, weigh_rows
 from cvtgs.io import change_axes
 from cvtgs.io.atomic import make_folder
 from cvtgs.io.axes import SCENE_AXES, checked_axes
@@ -31,7 +31,14 @@ from cvtgs.io.ply import open_rows
 from cvtgs.mergenet import Checkpoint
 from cvtgs.outofcore import Workers
 from cvtgs.outofcore.job import Job, in_folder, started
-from cvtgs.outofcore.memory import check_memory, chosen_blocks, memory_to_plan, sample_rows
+from cvtgs.outofcore.memory import (
+    check_memory,
+    chosen_blocks,
+    memory_to_plan,
+    merging_in_levels,
+    sample_rows,
+    stream_bytes,
+)
 from cvtgs.outofcore.rows import BlockRows, analysis_of, read_rows
 from cvtgs.outofcore.run import check_config, rows_per_range
 from cvtgs.outofcore.scan import read_sample
@@ -100,6 +107,11 @@ class StreamJob(Job):
         choices = repr((*options, self.environment_radii))
         facts = [Job.key(self, checkpoint), self.level_counts, choices]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+
+    @property
+    def file_bytes(self) -> int:
+        """Estimate of the bytes of all files of the job."""
+        return stream_bytes(self.source, sum(self.level_counts))
 
     @property
     def output(self) -> Path:
@@ -233,7 +245,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
         )
     merged = [target for target in targets if target < rows.count] or targets
     room = memory or memory_to_plan()
-    merging = finer_count(merged[0], rows.count, simplifier.config.allocation)
+    merging = merging_in_levels(targets, rows, simplifier.config.allocation)
     job = StreamJob(
         folder="",
         source=rows,
