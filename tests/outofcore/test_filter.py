@@ -58,7 +58,7 @@ def test_the_faintest_of_a_haze_are_left_out_up_to_its_share(scene, tmp_path) ->
 @pytest.mark.parametrize("rows", [400, 1000])
 def test_a_sample_leaves_few_more_than_wanted(scene, tmp_path, rows, monkeypatch) -> None:
     """With as many as the sample predicts, half of all runs would have too few, and no filter."""
-    monkeypatch.setattr(run, "sample_rows", lambda memory: rows)
+    monkeypatch.setattr(run, "sample_rows", lambda memory, source: rows)
     cvtgs.save(scene, tmp_path / "in.ply")
     for target in (600, 1000):
         report = simplify_file(

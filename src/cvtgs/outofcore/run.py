@@ -167,7 +167,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         config=simplifier.config,
         has_network=simplifier.checkpoint is not None,
         range_rows=range_rows,
-        sample_rows=sample_rows(room),
+        sample_rows=sample_rows(room, rows),
         cell_room=min(cell_room(memory), most_cells(target, rows.count, allocation)),
         axes=(
             SCENE_AXES

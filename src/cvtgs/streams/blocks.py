@@ -255,7 +255,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
         config=simplifier.config,
         has_network=simplifier.checkpoint is not None,
         range_rows=rows_per_range(rows.count),
-        sample_rows=sample_rows(room),
+        sample_rows=sample_rows(room, rows),
         form=form,
         level_counts=tuple(targets),
         chunk_gaussians=chunk_gaussians,
