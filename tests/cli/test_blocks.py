@@ -1,6 +1,7 @@
 """What commands that work block by block print, and which files they leave."""
 
 import argparse
+import re
 from pathlib import Path
 
 import pytest
@@ -159,8 +160,27 @@ def test_images_leave_less_memory_for_a_stream_in_one_piece(
     assert "streams in blocks need a preset without images" in capsys.readouterr().err
     assert main([*words, "--memory", "600MB"]) == 1
     error = capsys.readouterr().err
-    assert f"at least {LEAST_BYTES + IMAGE_BYTES:,} (" in error
-    assert " MB) with images of the scene; found 600000000." in error
+    assert f"--memory must be at least {(LEAST_BYTES + IMAGE_BYTES) / 1e6:g} MB: " in error
+    assert "images of the scene 400 MB, " in error
+    assert error.endswith("need the rest; found '600MB'.\n")
+
+
+@pytest.mark.parametrize(("amount", "preset"), [("1MB", "draft"), ("600MB", "matched")])
+def test_too_little_memory_is_refused_alike_with_and_without_images(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], amount: str, preset: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr("cvtgs.outofcore.memory.block_count", lambda *_, **__: 4)
+    cvtgs.save(random_scene(300), tmp_path / "in.ply")
+    words = ["simplify", str(tmp_path / "in.ply"), str(tmp_path / "out.ply"), "--rho", "0.1"]
+    assert main([*words, "--preset", preset, "--memory", amount]) == 1
+    least = LEAST_BYTES + (IMAGE_BYTES if preset == "matched" else 0)
+    wanted = (
+        rf"cvtgs: error: --memory must be at least {least / 1e6:g} MB: torch and scipy take "
+        rf"\d+ MB, (images of the scene 400 MB, )?and .* need the rest; found '{amount}'\.\n"
+    )
+    assert re.fullmatch(wanted, capsys.readouterr().err)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.ply"]
 
 
 def test_a_level_of_a_stream_is_refused_in_blocks_as_in_one_piece(

@@ -9,6 +9,7 @@ import cvtgs
 from cvtgs import Simplifier
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.outofcore import simplify_file
+from cvtgs.outofcore.memory import LEAST_BYTES
 from cvtgs.streams import stream_file
 from scenes import random_scene
 
@@ -22,7 +23,9 @@ WRONG: list[tuple[str, Any, str]] = [
     ("workers", 3, "workers must be of type Workers or None, found int."),
     ("listener", 3, "listener must be a function of a progress event, found 3."),
     ("simplifier", "fast", "simplifier must be of type Simplifier or None, found str."),
-    ("memory", 10**6, "memory must be a whole number of bytes, at least "),
+    ("memory", 10**6, f"memory must be at least {LEAST_BYTES / 1e6:g} MB: torch and scipy take "),
+    ("memory", 2.5, "memory must be a whole number of bytes above 0, found 2.5."),
+    ("memory", "4GB", "memory must be a whole number of bytes above 0, found '4GB'."),
 ]
 WRONG_OF_FILES: list[tuple[str, Any, str]] = [
     *WRONG,

@@ -222,9 +222,8 @@ def test_reports_of_refined_blocks_are_joined(other: str, stopped: str) -> None:
 
 def test_images_raise_the_least_memory(source, tmp_path):
     least = LEAST_BYTES + IMAGE_BYTES
-    with pytest.raises(
-        InvalidArgumentError, match=rf"at least {least:,} \([\d.]+ MB\) with images"
-    ):
+    text = rf"memory must be at least {least / 1e6:g} MB: .* images of the scene 400 MB, .*; found "
+    with pytest.raises(InvalidArgumentError, match=rf"{text}{least - 1:,} bytes\."):
         in_blocks(source, tmp_path / "no.ply", MATCHED, blocks=None, memory=least - 1)
 
 

@@ -258,10 +258,10 @@ def test_cells_that_merge_together_do_not_depend_on_every_byte() -> None:
 
 def test_blocks_need_the_least_memory(tmp_path: Path) -> None:
     cvtgs.save(cvtgs.synthetic.scene("object", 200, sh_degree=0), tmp_path / "a.ply")
-    for wrong in (100_000_000, 5e8, "1GB"):
-        with pytest.raises(
-            InvalidArgumentError, match=rf"number of bytes, at least {LEAST_BYTES:,} \("
-        ):
+    least = rf"memory must be at least {LEAST_BYTES / 1e6:g} MB: .*; found 100,000,000 bytes\."
+    no_bytes = "memory must be a whole number of bytes above 0, found "
+    for wrong, text in ((100_000_000, least), (5e8, no_bytes), ("1GB", no_bytes)):
+        with pytest.raises(InvalidArgumentError, match=text):
             simplify_file(tmp_path / "a.ply", tmp_path / "b.ply", 0.1, memory=wrong, blocks=2)
 
 

@@ -61,8 +61,26 @@ def memory_of(options: argparse.Namespace) -> int:
         raise InvalidArgumentError(f"--workers must be at least 1, found {options.workers}.")
     if options.memory is None:
         return memory_to_plan()
-    try:
+    with _named_as_option():
         return read_bytes(options.memory)
+
+
+def check_given_memory(
+    options: argparse.Namespace, memory: int, config: "cvtgs.SimplifyConfig"
+) -> None:
+    """Raise if ``--memory`` is too small for blocks with images of the scene."""
+    from cvtgs.outofcore.memory import check_memory
+
+    if options.memory is not None:
+        with _named_as_option():
+            check_memory(memory, with_images=config.uses_images, written=options.memory)
+
+
+@contextmanager
+def _named_as_option() -> Iterator[None]:
+    """Let errors call the memory ``--memory``."""
+    try:
+        yield
     except InvalidArgumentError as error:
         raise InvalidArgumentError(f"--{error}") from None
 
@@ -133,6 +151,7 @@ def block_memory(options: argparse.Namespace, config: "cvtgs.SimplifyConfig") ->
                 )
         check_block_device(options)
         check_config(config)
+        check_given_memory(options, memory, config)
     except (ConfigError, InvalidArgumentError):
         if options.memory is not None or options.scheduler is not None:
             raise

@@ -11,6 +11,7 @@ from cvtgs.cli.blocks import (
     add_block_options,
     block_workers,
     check_block_device,
+    check_given_memory,
     memory_of,
     unused_block_options,
 )
@@ -127,7 +128,7 @@ def stream_blocks(
     """Write a stream in blocks if the scene does not fit into memory; return whether it did."""
     from cvtgs.io.axes import SCENE_AXES
     from cvtgs.io.ply import open_rows
-    from cvtgs.outofcore.memory import IMAGE_BYTES, block_count, check_memory, merging_in_levels
+    from cvtgs.outofcore.memory import IMAGE_BYTES, block_count, merging_in_levels
     from cvtgs.outofcore.run import check_config
     from cvtgs.streams import stream_file
     from cvtgs.streams.plan import CHUNK_GAUSSIANS
@@ -138,7 +139,7 @@ def stream_blocks(
             rows = open_rows(options.input)
             targets = [cvtgs.target_count(rows.count, rho) for rho in rhos]
             merging = merging_in_levels(targets, rows, config.allocation)
-            check_memory(memory if asked else None, with_images=config.uses_images)
+            check_given_memory(options, memory, config)
             room = memory - IMAGE_BYTES if config.uses_images else memory
             if block_count(rows, room, merging=merging) == 1:
                 return False

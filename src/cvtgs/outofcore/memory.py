@@ -19,7 +19,7 @@ from cvtgs.grouping import finer_count
 from cvtgs.io.ply import PlyRows
 from cvtgs.outofcore.scan import SAMPLE_ROWS
 from cvtgs.processes import Workers, pool_size
-from cvtgs.text import counted, size_text
+from cvtgs.text import counted, shown, size_text
 
 LIBRARY_BYTES = 280_000_000 if torch.version.cuda is None else 430_000_000
 """Interpreter, torch and scipy. The CUDA build of torch takes 150 MB more of its own, and maps
@@ -61,12 +61,7 @@ def read_bytes(text: str) -> int:
         raise InvalidArgumentError(f"memory must be an amount such as 4GB, found {text!r}.")
     unit = (1024 if match[3] else 1000) ** " KMGT".index(match[2] or " ")
     amount = min(int(min(float(match[1]), 1e30) * unit), sys.maxsize)
-    if amount < LEAST_BYTES:
-        raise InvalidArgumentError(
-            f"memory must be at least {LEAST_BYTES / 1e6:g} MB: torch and scipy take "
-            f"{LIBRARY_BYTES / 1e6:g} MB, and the sample, the grids and a small block need the "
-            f"rest; found {text!r}."
-        )
+    check_memory(amount, with_images=False, written=text)
     return amount
 
 
@@ -84,13 +79,23 @@ def available_memory() -> int:
     return max(0, min(rooms))
 
 
-def check_memory(memory: int | None, *, with_images: bool) -> None:
-    """Raise if the memory that was given is too small for any run in blocks."""
-    least = LEAST_BYTES + (IMAGE_BYTES if with_images else 0)
-    if memory is not None and whole_number(memory) < least:
+def check_memory(memory: int | None, *, with_images: bool, written: str | None = None) -> None:
+    """Raise if the memory that was given, maybe as a text, is too small for any run in blocks."""
+    if memory is None:
+        return
+    given = whole_number(memory)
+    if given < 0:
         raise InvalidArgumentError(
-            f"memory must be a whole number of bytes, at least {least:,} ({size_text(least)})"
-            f"{' with images of the scene' * with_images}; found {memory!r}."
+            f"memory must be a whole number of bytes above 0, found {shown(memory)}."
+        )
+    least = LEAST_BYTES + (IMAGE_BYTES if with_images else 0)
+    if given < least:
+        images = f" images of the scene {IMAGE_BYTES / 1e6:g} MB," if with_images else ""
+        found = f"{given:,} bytes" if written is None else repr(written)
+        raise InvalidArgumentError(
+            f"memory must be at least {least / 1e6:g} MB: torch and scipy take "
+            f"{LIBRARY_BYTES / 1e6:g} MB,{images} and the sample, the grids and a small block need "
+            f"the rest; found {found}."
         )
 
 
