@@ -2,9 +2,9 @@
 
 import os
 import platform
+import shutil
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from cvtgs.errors import InvalidArgumentError, RunError, warn
 from cvtgs.evaluation import Comparison, EvaluationSettings, compare
 from cvtgs.evaluation.compare import check_scores
 from cvtgs.io import load, load_cameras, scene_file, scene_size
-from cvtgs.io.atomic import make_folder
+from cvtgs.io.atomic import atomic_output, check_outputs
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import SimplifyReport
 from cvtgs.scene import GaussianScene
@@ -148,7 +148,7 @@ def run_tasks(
         try:
             runs.append(run(task))
         except RunError as error:
-            reason = str(error).replace(unnamed, "") if unnamed else str(error)
+            reason = str(error).replace(unnamed, "")
             failures.append(
                 Failure(name=task.name, preset=task.preset, rho=task.rho, reason=reason)
             )
@@ -160,6 +160,17 @@ def run_tasks(
     for failure in failures:
         warn(f"{failure.name} failed: {failure.reason}")
     return runs, failures
+
+
+def keep_results(runs: Sequence[Run], folder: Path) -> None:
+    """Move the results of all runs to a folder; replaced files keep their links and permissions."""
+    for run in runs:
+        with (
+            run.path.open("rb") as file,
+            atomic_output(folder / run.path.name, overwrite=True) as output,
+        ):
+            shutil.copyfileobj(file, output)
+        run.path.unlink()
 
 
 def count_shared(views: Cameras, training: Path | None) -> int:
@@ -234,7 +245,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         settings: Background, LPIPS network and backend.
         device: Any torch device, or ``auto``.
         folder: Folder to keep the results in, made if it is missing, as ``fast_0.01.ply``; files
-            of the same name are replaced. None keeps no results.
+            of the same name are replaced, none before all are measured. None keeps no results.
         trust_sizes: Whether to believe a compressed source that claims far more Gaussians than its
             bytes can hold.
         listener: Called after each run and image.
@@ -267,7 +278,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         )
     where = chosen_device(device)
     if folder is not None:
-        make_folder(folder)
+        check_outputs(folder, [task.file_name for task in tasks], overwrite=True)
         check_results(source, Path(folder), tasks)
     full, source_name = load(source, trust_sizes=trust_sizes), printable_name(Path(source).name)
     full = full.to(where)
@@ -281,8 +292,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
             f"presets that use images are fitted to {shared} of the {counted(len(views), 'view')} "
             f"that score, which favours them; the test split of {training} has other views."
         )
-    kept = None if folder is None else nullcontext(folder)
-    with kept or TemporaryDirectory(prefix="cvtgs-") as name:
+    with TemporaryDirectory(prefix="cvtgs-" if folder is None else ".cvtgs-", dir=folder) as name:
         place = Path(name)
         start = start_seconds()
         run = partial(
@@ -293,8 +303,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
             device=str(device),
             trust_sizes=trust_sizes,
         )
-        unnamed = "" if kept else f"{place}{os.sep}"
-        runs, failures = run_tasks(tasks, run, unnamed=unnamed, listener=listener)
+        runs, failures = run_tasks(tasks, run, unnamed=f"{place}{os.sep}", listener=listener)
         sizes = {run.task.name: run.path.stat().st_size for run in runs}
         comparison = compare(
             full,
@@ -306,6 +315,8 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
             settings=settings,
             listener=listener,
         )
+        if folder is not None:
+            keep_results(runs, Path(folder))
     tradeoff = Tradeoff(
         source=source_name,
         source_count=len(full),
