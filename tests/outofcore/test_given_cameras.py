@@ -67,6 +67,47 @@ def test_cameras_that_miss_the_scene_are_refused(source, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("blind", [5, 6])
+def test_cameras_most_of_which_see_nothing_are_a_warning_as_in_one_piece(
+    scene, source, tmp_path, blind
+):
+    cameras = ring(10)
+    turned = cameras.viewmats.clone()
+    turned[:blind] = torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ turned[:blind]
+    away, text = replace(cameras, viewmats=turned), "^6 of 10 cameras see nothing of the scene; gi"
+    simplifier = Simplifier(config=SimplifyConfig.from_mapping(MATCHED), device="cpu")
+    with pytest.warns(UserWarning, match=text) if blind > 5 else nullcontext():
+        simplifier.run(scene, count=150, cameras=away)
+    with pytest.warns(UserWarning, match=text) if blind > 5 else nullcontext():
+        in_blocks(source, tmp_path / "out.ply", MATCHED, cameras=away)
+
+
+def test_cameras_see_protected_rows_too(two_objects, tmp_path):
+    """Eight of ten look at the second object only, which a box protects."""
+    turned = ring(10).viewmats.clone()
+    turned[:8, 1, 3] -= 60.0
+    boxes = [cvtgs.boxes.Box(min=(-30.0, 30.0, -30.0), max=(30.0, 90.0, 30.0))]
+    simplifier = Simplifier(config=SimplifyConfig.from_mapping(MATCHED), device="cpu")
+    cameras = replace(ring(10), viewmats=turned)
+    report = simplify_file(
+        two_objects, tmp_path / "out.ply", count=3150, blocks=BLOCKS, boxes=boxes,
+        simplifier=simplifier, cameras=cameras,
+    )  # fmt: skip
+    assert (report.kept_count, report.output_count) == (3000, 3150)
+
+
+@pytest.mark.parametrize("given", [None, ring(10)])
+def test_images_that_show_nothing_are_a_warning_as_in_one_piece(scene, tmp_path, given):
+    faint = scene.with_tensors({"logit_opacities": torch.full((len(scene),), -9.0)})
+    cvtgs.save(faint, tmp_path / "in.ply")
+    simplifier = Simplifier(config=SimplifyConfig.from_mapping(MATCHED), device="cpu")
+    text = "^images of the scene show nothing, so they change nothing: Gaussians are too faint"
+    with pytest.warns(UserWarning, match=text):
+        simplifier.run(faint, count=150, cameras=given)
+    with pytest.warns(UserWarning, match=text):
+        in_blocks(tmp_path / "in.ply", tmp_path / "out.ply", MATCHED, cameras=given)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("settings", [MATCHED, REFINED])
 def test_given_cameras_decide_what_blocks_look_like(scene, source, tmp_path, settings):

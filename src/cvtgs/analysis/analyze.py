@@ -294,14 +294,19 @@ def measure_contributions(
         share = config.visibility.mass_share
         apparent = measured_areas(apparent, opacities, rendered, share=share)
     else:
-        warn(
-            "images of the scene show nothing, so they change nothing: Gaussians are too faint, or "
-            f"the scene is so small that they are nearer to cameras than {NEAR_PLANE} units, where "
-            "renderers draw nothing; scale it up."
-        )
+        warn_of_empty_images()
     haze = plan_haze(float(haze_share(opacities, apparent * opacities, config)), config)
     plan = analysis.plan.model_copy(update={"haze": haze})
     return replace(analysis, apparent_areas=apparent, plan=plan, observed=observed)
+
+
+def warn_of_empty_images() -> None:
+    """Warn that no image of the scene shows anything."""
+    warn(
+        "images of the scene show nothing, so they change nothing: Gaussians are too faint, or "
+        f"the scene is so small that they are nearer to cameras than {NEAR_PLANE} units, where "
+        "renderers draw nothing; scale it up."
+    )
 
 
 def visibility_cameras(

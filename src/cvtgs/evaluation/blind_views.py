@@ -42,17 +42,7 @@ def check_seen(
             f"{name} spans less than {LEAST_FILLED:.0%} of most images, so they show mostly "
             f"background; give cameras of this scene, in its units."
         )
-    points = _drawn(scene)
-    blind = cameras.to("cpu").singles()
-    for some in (points[:: -(-len(points) // SAMPLED)].cpu(), points):  # all only in doubt
-        exact = some.double()
-        blind = [camera for camera in blind if not camera.shows_any(exact)]
-        seeing = len(cameras) - len(blind)
-        if seeing >= max(len(blind), 2 if refines else 1):
-            return
-    images = (render_views(scene, camera.fitted(PREVIEW), backend=backend) for camera in blind)
-    # Gaussians beside an image may reach into it
-    empty = sum(float(image.alpha.mean()) < LEAST_COVER for image in images)
+    empty = _count_blind(scene, cameras, enough=2 if refines else 1, backend=backend)
     if empty == len(cameras):
         raise InvalidArgumentError(
             f"the cameras must see {name}, found nothing of it in any of {len(cameras)} "
@@ -63,11 +53,38 @@ def check_seen(
             f"a refinement needs at least 2 cameras that see {name}, one of them to be held out; "
             f"found 1 of {len(cameras)}."
         )
-    if 2 * empty > len(cameras) and not is_sample:
+    if not is_sample:
+        _warn_of_blind(empty, len(cameras), name)
+
+
+def warn_of_blind(scene: GaussianScene, cameras: Cameras, *, name: str) -> None:
+    """Warn if most cameras see nothing of a scene."""
+    _warn_of_blind(_count_blind(scene, cameras), len(cameras), name)
+
+
+def _warn_of_blind(blind: int, count: int, name: str) -> None:
+    if 2 * blind > count:
         warn(
-            f"{empty} of {len(cameras)} cameras see nothing of {name}; give cameras of this "
-            f"scene, in its axes and units."
+            f"{blind} of {count} cameras see nothing of {name}; give cameras of this scene, in "
+            f"its axes and units."
         )
+
+
+def _count_blind(
+    scene: GaussianScene, cameras: Cameras, *, enough: int = 1, backend: BackendName = "auto"
+) -> int:
+    """Count cameras that see nothing; 0 if at least half of them, and ``enough``, see a centre."""
+    points = _drawn(scene)
+    blind = cameras.to("cpu").singles()
+    for some in (points[:: -(-len(points) // SAMPLED)].cpu(), points):  # all only in doubt
+        exact = some.double()
+        blind = [camera for camera in blind if not camera.shows_any(exact)]
+        seeing = len(cameras) - len(blind)
+        if seeing >= max(len(blind), enough):
+            return 0
+    images = (render_views(scene, camera.fitted(PREVIEW), backend=backend) for camera in blind)
+    # Gaussians beside an image may reach into it
+    return sum(float(image.alpha.mean()) < LEAST_COVER for image in images)
 
 
 def shows(scene: GaussianScene, camera: Cameras, alpha: Float[Tensor, "1 h w"]) -> bool:

@@ -21,8 +21,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.analysis import drop_unused_bands, restore_columns
-from cvtgs.analysis.analyze import measured_areas, visibility_cameras
-from cvtgs.analysis.effects import drop_mip_tag, select_columns
+from cvtgs.analysis.analyze import measured_areas, visibility_cameras, warn_of_empty_images
+from cvtgs.analysis.effects import EffectPlan, drop_mip_tag, select_columns
 from cvtgs.boxes import inside
 from cvtgs.cameras import Cameras
 from cvtgs.clock import join_costs
@@ -31,6 +31,7 @@ from cvtgs.config.base import Record
 from cvtgs.devices import one_thread
 from cvtgs.edit import concatenate
 from cvtgs.errors import without_warnings
+from cvtgs.evaluation.blind_views import warn_of_blind
 from cvtgs.grouping import importance_by_errors
 from cvtgs.io import load
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
@@ -121,11 +122,13 @@ def measure(job: Job, block: int) -> None:
 
 
 def add_contributions(job: Job) -> None:
-    """Write the sums of masses and contributions over all blocks."""
+    """Write the sums of masses and contributions over all blocks; warn if images show nothing."""
     sums = {"mass": 0.0, "pixels": 0.0}
     for block in job.blocks_with_rows():
         tensors = job.read("contributions", block)
         sums = {name: total + float(tensors[name]) for name, total in sums.items()}
+    if sums["pixels"] == 0.0:
+        warn_of_empty_images()
     job.write_file(MEASURED, json.dumps(sums).encode())
 
 
@@ -153,6 +156,14 @@ class Drawn(NamedTuple):
     small: GaussianScene
     full: GaussianScene
     fixed: int  # number of the others
+
+
+@one_thread()
+def warn_of_blind_cameras(job: Job) -> None:
+    """Warn if most given cameras see nothing of the simplified blocks and the protected rows."""
+    if job.cameras is not None:
+        parts = _drawn_parts(job, job.read_scan().plan)
+        warn_of_blind(concatenate(parts), job.cameras, name="the scene")
 
 
 @one_thread()
@@ -288,23 +299,29 @@ def _pixels_of(members: GaussianScene, camera: Cameras) -> Float[Tensor, ""]:
 
 def _draw(job: Job, block: int, own: GaussianScene, found: BlockCells) -> Drawn:
     """Read the other simplified blocks, and build the scenes to render."""
-    plan, effects = job.read_scan().plan, job.config.effects
-
-    def bare(scene: GaussianScene) -> GaussianScene:
-        used = drop_unused_bands(select_columns(scene, effects), plan)
-        # Only files tell flat Gaussians apart; simplified blocks are thick if the plan says so.
-        comments = TWO_SCALES.removed_from(used.comments)
-        return replace(used.with_tensors({}, {}), comments=comments, layout=())
-
-    parts = [bare(job.source.scene(rows)) for rows in kept_rows(job)]
-    parts += [
-        bare(load(job.small_path(other))) for other in job.blocks_with_cells() if other != block
-    ]
-    own, members = bare(own), bare(found.scene)
-    fixed = concatenate([*parts, own[:0]])
+    plan = job.read_scan().plan
+    own, members = _bare(job, own, plan), _bare(job, found.scene, plan)
+    fixed = concatenate([*_drawn_parts(job, plan, without=block), own[:0]])
     return Drawn(
         small=concatenate([fixed, own]), full=concatenate([fixed, members]), fixed=len(fixed)
     )
+
+
+def _drawn_parts(
+    job: Job, plan: EffectPlan, *, without: int | None = None
+) -> Sequence[GaussianScene]:
+    """Read protected Gaussians, then the simplified ones of all blocks or of all but one."""
+    parts = [_bare(job, job.source.scene(rows), plan) for rows in kept_rows(job)]
+    others = (block for block in job.blocks_with_cells() if block != without)
+    return [*parts, *(_bare(job, load(job.small_path(block)), plan) for block in others)]
+
+
+def _bare(job: Job, scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
+    """Return a scene with what renderers draw alone."""
+    used = drop_unused_bands(select_columns(scene, job.config.effects), plan)
+    # Only files tell flat Gaussians apart; simplified blocks are thick if the plan says so.
+    comments = TWO_SCALES.removed_from(used.comments)
+    return replace(used.with_tensors({}, {}), comments=comments, layout=())
 
 
 def _near(means: Float[Tensor, "n 3"], own: Float[Tensor, "m 3"]) -> Tensor:

@@ -31,6 +31,7 @@ from cvtgs.outofcore.images import (
     join_matchings,
     join_refinements,
     measure,
+    warn_of_blind_cameras,
 )
 from cvtgs.outofcore.job import Job, Manifest, in_folder, started
 from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
@@ -258,6 +259,8 @@ def _run_blocks(job: Job, workers: Workers, clock: StageClock) -> int:
         steps["images"] = improve
     for name, step in steps.items():
         with clock.stage(name, len(with_cells)) as advance:
+            if step is improve:
+                warn_of_blind_cameras(job)
             list(with_progress(workers(partial(step, job), with_cells), advance))
     return resumed
 
