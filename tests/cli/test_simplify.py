@@ -2,6 +2,7 @@
 
 import json
 import math
+import weakref
 from pathlib import Path
 
 import pytest
@@ -147,6 +148,25 @@ def test_a_damaged_file_leaves_no_output(source, tmp_path, capsys):
     assert str(source) in errors
     assert errors.count("\n") == 1
     assert not output.exists()
+
+
+def test_the_full_scene_takes_no_memory_while_the_result_is_written(source, tmp_path, monkeypatch):
+    read, alive = [], []
+
+    def load(path: Path, **options: object) -> cvtgs.GaussianScene:
+        scene = load_scene(path, **options)
+        read.append(weakref.ref(scene.means))
+        return scene
+
+    def save(scene: cvtgs.GaussianScene, path: Path, **options: object) -> None:
+        alive.extend(means() is not None for means in read)
+        save_scene(scene, path, **options)
+
+    load_scene, save_scene = cvtgs.io.load, cvtgs.io.save
+    monkeypatch.setattr(cvtgs.io, "load", load)
+    monkeypatch.setattr(cvtgs.io, "save", save)
+    assert main(["simplify", str(source), str(tmp_path / "small.sog"), "--rho", "0.5"]) == 0
+    assert alive == [False]
 
 
 @pytest.mark.cuda

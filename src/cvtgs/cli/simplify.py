@@ -306,6 +306,7 @@ def _simplify_in_memory(
             cameras=cameras,
             keep=keep,
         )
+    del scene  # its memory is enough for what most formats encode
     started = time.perf_counter()
     make_output_folder(options)
     cvtgs.io.save(small, options.output, overwrite=options.overwrite, axes=axes.target)
