@@ -1,13 +1,16 @@
 """Photographs that are matched to cameras by name."""
 
+import weakref
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 import cvtgs
 from cvtgs.errors import FileFormatError, InvalidArgumentError
-from cvtgs.evaluation import fit_cameras, load_photographs
-from cvtgs.evaluation.images import encode, read_image
+from cvtgs.evaluation import EvaluationSettings, fit_cameras, load_photographs
+from cvtgs.evaluation.images import Photographs, encode, read_image
 
 
 def rig_of(*names: str) -> cvtgs.Cameras:
@@ -142,3 +145,29 @@ def test_an_image_of_too_many_pixels_is_one_sentence(tmp_path, monkeypatch):
     (tmp_path / "a.png").write_bytes(encode(np.zeros((8, 8, 3), np.uint8), "png"))
     with pytest.raises(FileFormatError, match=r"a\.png: must have fewer pixels; Image size \(64"):
         read_image(tmp_path / "a.png", (8, 8), (0.0, 0.0, 0.0))
+
+
+def test_evaluate_reads_photographs_one_by_one(tmp_path, monkeypatch):
+    """Read at once, 300 photographs of 1,600 x 1,200 pixels would take 7 GB."""
+    names, read, alive = tuple(f"{number}.png" for number in range(6)), [], []
+    for name in names:
+        (tmp_path / name).write_bytes(encode(np.full((36, 48, 3), 50, np.uint8), "png"))
+    scene = cvtgs.synthetic.scene("object", 200, sh_degree=0, seed=0)
+    views = cvtgs.views.automatic_views(scene, 6, width=48, height=36)
+    rig = replace(views, names=names)
+
+    def note(*args: object) -> np.ndarray:
+        image = read_image(*args)
+        alive.append(sum(one() is not None for one in read))
+        read.append(weakref.ref(image))
+        return image
+
+    settings = EvaluationSettings(lpips="off")
+    whole = load_photographs(tmp_path, rig)
+    expected = cvtgs.evaluate(scene, {"a": scene}, rig, photographs=whole, settings=settings)
+    monkeypatch.setattr("cvtgs.evaluation.images.read_image", note)
+    lazy = Photographs(tmp_path, rig, background=(0.0, 0.0, 0.0))
+    found = cvtgs.evaluate(scene, {"a": scene}, rig, photographs=lazy, settings=settings)
+    assert found == expected
+    assert len(alive) == 6
+    assert max(alive) <= 2

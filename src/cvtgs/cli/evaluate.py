@@ -129,6 +129,8 @@ def add_evaluate(add_parser: AddParser) -> None:
 
 def evaluate(options: argparse.Namespace) -> None:
     """Run ``cvtgs evaluate``."""
+    from cvtgs.evaluation.images import Photographs
+
     settings = evaluation_settings(options)
     scenes, sizes = _read_scenes(options)
     (name, reference), *others = scenes.items()
@@ -136,9 +138,7 @@ def evaluate(options: argparse.Namespace) -> None:
         cameras = choose_cameras(options, reference)
         photographs = None
         if options.images is not None:
-            photographs = cvtgs.evaluation.load_photographs(
-                options.images, cameras, background=settings.background
-            )
+            photographs = Photographs(options.images, cameras, background=settings.background)
         evaluation = cvtgs.evaluate(
             reference,
             dict(others),

@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from cvtgs.clock import check_listener
 from cvtgs.counts import checked_whole, spread_rows
 from cvtgs.errors import InvalidArgumentError, warn
 from cvtgs.evaluation.blind_views import check_seen, shows
-from cvtgs.evaluation.images import as_bytes
+from cvtgs.evaluation.images import Photographs, as_bytes
 from cvtgs.evaluation.scorer import (
     Evaluation,
     EvaluationSettings,
@@ -90,7 +91,7 @@ def evaluate(
     cameras: Cameras | None = None,
     *,
     reference_name: str = "full",
-    photographs: Float[Tensor, "c h w 3"] | None = None,
+    photographs: Float[Tensor, "c h w 3"] | Photographs | None = None,
     settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
     listener: ProgressListener = silent,
 ) -> Evaluation:
@@ -237,7 +238,7 @@ def _named_scenes(
 
 
 def _chosen_cameras(
-    cameras: Cameras | None, source: SceneLike, scene: GaussianScene, photographs: Tensor | None
+    cameras: Cameras | None, source: SceneLike, scene: GaussianScene, photographs: object
 ) -> Cameras:
     """Return given cameras, those beside the file of the scene, or automatic ones."""
     if cameras is not None:
@@ -269,7 +270,7 @@ def check_scores(
 def _checked_metrics(
     reference: GaussianScene,
     cameras: Cameras,
-    photographs: Float[Tensor, "c h w 3"] | None,
+    photographs: Float[Tensor, "c h w 3"] | Photographs | None,
     settings: EvaluationSettings,
     *,
     name: str,
@@ -278,7 +279,7 @@ def _checked_metrics(
     if len(checked_cameras(cameras)) == 0:
         raise InvalidArgumentError("an evaluation needs at least one camera, found none.")
     check_kinds({"settings": EvaluationSettings}, {"settings": settings})
-    if photographs is not None:
+    if photographs is not None and not isinstance(photographs, Photographs):
         shape = f"{len(cameras)} {cameras.height} {cameras.width} 3"
         check_kinds({"photographs": Float[Tensor, shape]}, {"photographs": photographs})
         low, high = (float(end) for end in photographs.aminmax())
@@ -296,7 +297,7 @@ def _score_images(
     scenes: Mapping[str, GaussianScene],
     cameras: Cameras,
     *,
-    photographs: Float[Tensor, "c h w 3"] | None,
+    photographs: Float[Tensor, "c h w 3"] | Photographs | None,
     keep: Callable[[str, int, Tensor, Tensor], None] = lambda name, view, color, alpha: None,
     settings: EvaluationSettings,
     listener: ProgressListener,
@@ -316,7 +317,8 @@ def _score_images(
     blind: list[int] = []
     total, done = len(cameras) * len(scenes), 0
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
-    for view, camera in enumerate(cameras.singles()):
+    parts = photographs.split(1) if isinstance(photographs, Tensor) else photographs or ()
+    for view, (camera, photograph) in enumerate(zip_longest(cameras.singles(), parts)):
         truth: tuple[Tensor, Tensor] | None = None
         for name, scene in scenes.items():
             image = render_views(scene, camera, backend=settings.backend)
@@ -329,8 +331,8 @@ def _score_images(
             else:
                 alphas = image.alpha, truth[1].to(image.alpha)
                 against_full[name].append(metrics.compare(color, truth[0], alphas=alphas))
-            if photographs is not None:
-                found = metrics.compare(color, photographs[view : view + 1])
+            if photograph is not None:
+                found = metrics.compare(color, photograph)
                 against_photographs[name].append(found)
             done += 1
             listener(ProgressEvent(stage=STAGE, done=done, total=total))

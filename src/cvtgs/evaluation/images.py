@@ -193,12 +193,33 @@ def load_photographs(
         ...     load_photographs(images, cameras).shape
         torch.Size([1, 2, 4, 3])
     """
-    size = (cameras.width, cameras.height)
-    paths = _find_all(Path(folder), cameras)
-    images = torch.empty(len(paths), cameras.height, cameras.width, 3, dtype=torch.float32)
-    for image, path in zip(images, paths, strict=True):
-        image.copy_(torch.from_numpy(read_image(path, size, background)))
+    found = Photographs(folder, cameras, background=background)
+    images = torch.empty(len(found), cameras.height, cameras.width, 3, dtype=torch.float32)
+    for image, one in zip(images, found, strict=True):
+        image.copy_(one[0])
     return images
+
+
+class Photographs:
+    """What :func:`load_photographs` returns, one by one, each read when it is its turn."""
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        cameras: Cameras,
+        *,
+        background: tuple[float, float, float],
+    ) -> None:
+        self._paths = _find_all(Path(folder), cameras)
+        self._size = (cameras.width, cameras.height)
+        self._background = background
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def __iter__(self) -> Iterator[Float[Tensor, "1 h w 3"]]:
+        for path in self._paths:
+            yield torch.from_numpy(read_image(path, self._size, self._background))[None]
 
 
 @checked
