@@ -15,7 +15,7 @@ import torch
 
 import cvtgs
 from cvtgs.cameras import Cameras
-from cvtgs.errors import DroppedDataWarning, warn, without_warnings
+from cvtgs.errors import CameraWarning, DroppedDataWarning, warn, without_warnings
 from cvtgs.levels import write_levels
 from cvtgs.scene import GaussianScene
 from cvtgs.synthetic import scene as make
@@ -142,3 +142,15 @@ def test_left_out_warnings_are_those_of_a_category_in_one_thread() -> None:
         warn("later", DroppedDataWarning)
     found = [str(one.message) for one in caught]
     assert found == ["something else", "of another thread", "later"]
+
+
+def test_left_out_warnings_stay_left_out_within_inner_ones() -> None:
+    """The inner ones leave out a category in addition."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with without_warnings(DroppedDataWarning):
+            with without_warnings(CameraWarning):
+                warn("dropped", DroppedDataWarning)
+                warn("of cameras", CameraWarning)
+            warn("of cameras again", CameraWarning)
+    assert [str(one.message) for one in caught] == ["of cameras again"]

@@ -146,6 +146,10 @@ class DroppedDataWarning(UserWarning):
     """Data of a scene were dropped or clamped; the message says what, how much and why."""
 
 
+class CameraWarning(UserWarning):
+    """Cameras show little of a scene; steps after the first check need not say so again."""
+
+
 def warn(text: str, category: type[Warning] = UserWarning) -> None:
     """Issue a warning at the line of the caller's program that led to it."""
     if issubclass(category, _LEFT_OUT.get()):
@@ -162,7 +166,7 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
 @contextmanager
 def without_warnings(category: type[Warning] = Warning) -> Iterator[None]:
     """Issue no warnings of cvtgs of a category in this thread; filters are of the whole process."""
-    token = _LEFT_OUT.set((category,))
+    token = _LEFT_OUT.set((*_LEFT_OUT.get(), category))
     try:
         yield
     finally:

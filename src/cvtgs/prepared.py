@@ -1,6 +1,7 @@
 """Prepared: a scene to simplify repeatedly, with a fallback if the device lacks memory."""
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from typing import TypeVar
 
@@ -18,7 +19,13 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shortfall, target_count
 from cvtgs.devices import chosen_device, full_precision, threads_for_chunks, within_memory
 from cvtgs.edit import concatenate
-from cvtgs.errors import BLOCKS_ADVICE, InvalidArgumentError, memory_errors
+from cvtgs.errors import (
+    BLOCKS_ADVICE,
+    CameraWarning,
+    InvalidArgumentError,
+    memory_errors,
+    without_warnings,
+)
 from cvtgs.grouping import OrderedRows, add_neighbors, importance_by_errors, order_rows
 from cvtgs.mergenet import Checkpoint, Net
 from cvtgs.pipeline import Reduced, level_facts, reduce_scene
@@ -368,17 +375,19 @@ class Prepared:
             drop_unused_bands(select_columns(scene, choices), plan)
             for scene in (result.scene, self._scene)
         )
-        refined = refine(
-            small,
-            full,
-            cameras=self._cameras,
-            config=self._config.refine,
-            seed=self._config.seed,
-            device=self._device,
-            frozen=kept,
-            observed=analysis.observed if self._config.shares_images else None,
-            listener=self._listener,
-        )
+        has_warned = self._cameras is not None or plan.visibility.active
+        with without_warnings(CameraWarning) if has_warned else nullcontext():
+            refined = refine(
+                small,
+                full,
+                cameras=self._cameras,
+                config=self._config.refine,
+                seed=self._config.seed,
+                device=self._device,
+                frozen=kept,
+                observed=analysis.observed if self._config.shares_images else None,
+                listener=self._listener,
+            )
         scene = restore_columns(refined.scene, self._scene, plan)
         scene = concatenate([result.scene[:kept], scene[kept:]]) if kept else scene
         return Simplified(scene, join_reports(result.report, refined))

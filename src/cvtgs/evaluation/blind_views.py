@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.errors import InvalidArgumentError, InvalidSceneError, warn
+from cvtgs.errors import CameraWarning, InvalidArgumentError, InvalidSceneError, warn
 from cvtgs.evaluation.scorer import render_views
 from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.rendering import BackendName
@@ -40,7 +40,8 @@ def check_seen(
     if len(scene) >= FEW and float(((inside > 0) & (filled < LEAST_FILLED)).double().mean()) > 0.5:
         warn(
             f"{name} spans less than {LEAST_FILLED:.0%} of most images, so they show mostly "
-            f"background; give cameras of this scene, in its units."
+            f"background; give cameras of this scene, in its units.",
+            CameraWarning,
         )
     empty = _count_blind(scene, cameras, enough=2 if refines else 1, backend=backend)
     if empty == len(cameras):
@@ -66,7 +67,8 @@ def _warn_of_blind(blind: int, count: int, name: str) -> None:
     if 2 * blind > count:
         warn(
             f"{blind} of {count} cameras see nothing of {name}; give cameras of this scene, in "
-            f"its axes and units."
+            f"its axes and units.",
+            CameraWarning,
         )
 
 

@@ -10,7 +10,6 @@ differ in this block only: the other blocks show their simplified Gaussians in b
 import json
 import math
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from statistics import mean
@@ -30,7 +29,7 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.devices import one_thread
 from cvtgs.edit import concatenate
-from cvtgs.errors import without_warnings
+from cvtgs.errors import CameraWarning, without_warnings
 from cvtgs.evaluation.blind_views import warn_of_blind
 from cvtgs.grouping import importance_by_errors
 from cvtgs.io import load
@@ -191,8 +190,8 @@ def improve(job: Job, block: int) -> None:
             frozen=drawn.fixed,
         )
     if later is not None:
-        # Nobody gave generated views, so nobody can give better ones.
-        with nullcontext() if job.cameras is not None else without_warnings():
+        # The run has warned of given cameras; nobody can give better views than generated ones.
+        with without_warnings(Warning if job.cameras is None else CameraWarning):
             small, changes["refinement"] = refine(
                 small,
                 drawn.full,

@@ -53,6 +53,7 @@ from cvtgs.outofcore.sort import sort_into_blocks
 from cvtgs.prepared import check_cameras
 from cvtgs.processes import Result, Workers, with_progress
 from cvtgs.progress import ProgressListener, silent
+from cvtgs.rendering.projection import warn_of_near_plane
 from cvtgs.report import SimplifyReport, origin_of_views
 from cvtgs.scene import GaussianScene
 from cvtgs.simplifier import Simplifier
@@ -210,7 +211,10 @@ def _cameras_to_fit(
         check_seen(sample, given, name="the scene", is_sample=True)
         return given
     own = find_own_cameras(sample, source)
-    return None if own is None else own.cameras
+    if own is None:
+        return None
+    warn_of_near_plane(sample, own.cameras.singles(), name="the scene")
+    return own.cameras
 
 
 def rows_per_range(count: int) -> int:

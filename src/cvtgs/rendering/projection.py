@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.cameras import Cameras, view_scales
-from cvtgs.errors import InvalidArgumentError, warn
+from cvtgs.errors import CameraWarning, InvalidArgumentError, warn
 from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.scene import GaussianScene
 
@@ -329,5 +329,6 @@ def warn_of_near_plane(scene: GaussianScene, cameras: Sequence[Cameras], *, name
     if share > MOST_HIDDEN:
         warn(
             f"images of {name} lack {share:.0%} of the Gaussians before their cameras: renderers "
-            f"draw nothing nearer than {parameters.NEAR_PLANE} units; scale it up."
+            f"draw nothing nearer than {parameters.NEAR_PLANE} units; scale it up.",
+            CameraWarning,
         )
