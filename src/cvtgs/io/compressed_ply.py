@@ -21,6 +21,7 @@ from cvtgs.io.arrays import (
 from cvtgs.io.files import open_input
 from cvtgs.io.limits import FORMAT_LIMITS
 from cvtgs.io.ply.header import Header, check_size, header_bytes, read_header, row_dtype
+from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 
 __all__ = ["read_compressed_ply", "write_compressed_ply"]
@@ -145,7 +146,8 @@ def _check(header: Header, path: Path) -> None:
         return
     names = {name for name, kind in rest.items() if kind == "uchar"}
     own = {f"f_rest_{i}" for i in range(len(rest))}
-    if names != own or len(names) not in (9, 24, 45) or counts["sh"] != vertices:
+    known = [3 * count for count in REST_COUNTS]
+    if names != own or len(names) not in known or counts["sh"] != vertices:
         raise FileFormatError(
             f"{path}: element 'sh' must have 9, 24 or 45 uchar properties f_rest_0, f_rest_1, ... "
             f"for each of {vertices:,} vertices, found {len(names)} for {counts['sh']:,}."
