@@ -156,6 +156,7 @@ STAGES = {
         "Evaluation",
         "EvaluationSettings",
         "LpipsWeights",
+        "Photographs",
         "SceneImages",
         "SceneScores",
         "Score",

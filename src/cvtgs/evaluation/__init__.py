@@ -2,7 +2,7 @@
 
 from cvtgs.evaluation.compare import Comparison, SceneImages, compare, evaluate
 from cvtgs.evaluation.comparison_files import write_comparison
-from cvtgs.evaluation.images import fit_cameras, load_photographs
+from cvtgs.evaluation.images import Photographs, fit_cameras, load_photographs
 from cvtgs.evaluation.lpips import LpipsWeights, load_lpips, lpips
 from cvtgs.evaluation.metrics import alpha_bias, alpha_error, psnr, ssim
 from cvtgs.evaluation.scorer import Evaluation, EvaluationSettings, SceneScores, Score
@@ -12,6 +12,7 @@ __all__ = [
     "Evaluation",
     "EvaluationSettings",
     "LpipsWeights",
+    "Photographs",
     "SceneImages",
     "SceneScores",
     "Score",

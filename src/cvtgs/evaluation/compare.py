@@ -107,7 +107,8 @@ def evaluate(
         cameras: The cameras; None takes 8 of those beside the file of the full scene, in images of
             640 pixels, or else automatic views (:func:`cvtgs.views.automatic_views`).
         reference_name: Name of the full scene.
-        photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too.
+        photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too;
+            :class:`Photographs` of these cameras are read one by one.
         settings: Background, LPIPS network and backend.
         listener: Called before the first image and after each.
 

@@ -201,14 +201,24 @@ def load_photographs(
 
 
 class Photographs:
-    """What :func:`load_photographs` returns, one by one, each read when it is its turn."""
+    """What :func:`load_photographs` returns, one by one, each read when it is its turn.
+
+    Args:
+        folder: The folder of the photographs.
+        cameras: Cameras with names.
+        background: Colour behind transparent pixels, in [0, 1].
+
+    Raises:
+        InvalidArgumentError: As for :func:`load_photographs`.
+        InputNotFoundError: Likewise. What cannot be read is an error when it is its turn.
+    """
 
     def __init__(
         self,
         folder: str | os.PathLike[str],
         cameras: Cameras,
         *,
-        background: tuple[float, float, float],
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         self._paths = _find_all(Path(folder), cameras)
         self._size = (cameras.width, cameras.height)
