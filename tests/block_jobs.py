@@ -42,4 +42,5 @@ def unfinished_job(scene, folder, *, count, blocks, config=None, boxes=(), camer
         config=simplifier.config,
         has_network=True,
         range_rows=1 << 26,
+        cameras=cameras,
     )

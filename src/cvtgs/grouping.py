@@ -97,26 +97,30 @@ def weigh_rows(
     )
 
 
-def importance_by_errors(
-    small: GaussianScene,
-    partition: cells.Partition,
+def factors_by_errors(
+    means: Float[Tensor, "m 3"],
     *,
     errors: Float[Tensor, "m"],
     pixels: Float[Tensor, "m"],
-    count: int,
     power: float,
-) -> Float[Tensor, "n"]:
-    """Return factors on the masses of ``count`` Gaussians in the costs of merging.
+) -> Float[Tensor, "m"]:
+    """Return factors of cells on the masses of their members in the costs of merging.
 
     They are larger where ``errors``, squared ones, of cells that show in ``pixels`` are larger.
     """
-    near = cvt.nearest_neighbors(small.means, NEAR)
+    near = cvt.nearest_neighbors(means, NEAR)
     errors = errors.nan_to_num(0.0, 0.0, 0.0)  # images of extreme scenes overflow
     errors = errors + 0.5 * errors[near].sum(dim=1)  # also caused by what a cell does not cover
     logs = (errors + SMALL_ERROR * errors.mean()).clamp_min(1e-300).log()
     seen = pixels.double() / (pixels + 1.0)  # near 0 for cells that images hardly show
     logs = logs - (seen * logs).sum() / seen.sum().clamp_min(1e-300)
-    factors = (power * seen * logs).exp().clamp(1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
+    return (power * seen * logs).exp().clamp(1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
+
+
+def factors_of_members(
+    factors: Float[Tensor, "m"], partition: cells.Partition, count: int
+) -> Float[Tensor, "n"]:
+    """Return the factors of the cells of ``count`` Gaussians; 1 for those in no cell."""
     found = factors.new_ones(count)
     found[partition.order] = factors[segment_ids(partition.offsets, len(partition.order))]
     return found

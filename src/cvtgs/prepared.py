@@ -26,7 +26,13 @@ from cvtgs.errors import (
     memory_errors,
     without_warnings,
 )
-from cvtgs.grouping import OrderedRows, add_neighbors, importance_by_errors, order_rows
+from cvtgs.grouping import (
+    OrderedRows,
+    add_neighbors,
+    factors_by_errors,
+    factors_of_members,
+    order_rows,
+)
 from cvtgs.mergenet import Checkpoint, Net
 from cvtgs.pipeline import Reduced, level_facts, reduce_scene
 from cvtgs.progress import ProgressListener, silent
@@ -279,14 +285,13 @@ class Prepared:
         with clock.stage("errors"):
             drawn = found.scene if kept is None else concatenate([kept, found.scene])
             errors = error_shares(drop_unused_bands(drawn, analysis.plan), observed)
-            importance = importance_by_errors(
-                found.scene,
-                found.partition,
+            factors = factors_by_errors(
+                found.scene.means,
                 errors=errors[len(drawn) - len(found.scene) :],
                 pixels=cell_contributions(observed.contributions, found.partition),
-                count=len(valid),
                 power=power,
             )
+            importance = factors_of_members(factors, found.partition, len(valid))
         return reduce(analysis, importance=importance)
 
     def _order(

@@ -16,9 +16,10 @@ from cvtgs.analysis.analyze import visibility_cameras
 from cvtgs.cameras import Cameras
 from cvtgs.cli.main import main
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.matching import cell_contributions
-from cvtgs.outofcore import LocalWorkers, images, simplify_file
+from cvtgs.outofcore import LocalWorkers, image_errors, images, simplify_file
+from cvtgs.outofcore.allocate import KEY, read_rows_to_merge
 from cvtgs.outofcore.images import cameras_of_block
+from cvtgs.outofcore.merge import read_cells, read_report
 from cvtgs.rendering import contributions, render
 from refine_cases import ring
 from scenes import random_scene
@@ -149,81 +150,81 @@ def test_blocks_have_more_cells_where_images_err_only_with_given_cameras(scene, 
     assert errors["given", 1.0] < 0.97 * errors["given", 0.0]
 
 
-def test_every_member_of_a_block_is_in_a_cell_again(scene, tmp_path, monkeypatch):
-    """Also faint ones, of which the sort has left some; and the new cells are matched."""
+def test_cells_of_all_blocks_are_allocated_again_by_errors(scene, tmp_path):
+    """Also faint Gaussians that the sort leaves are in a cell again."""
     logits = torch.where(torch.arange(len(scene)) % 2 == 0, -3.0, scene.logit_opacities)
-    cvtgs.save(scene.with_tensors({"logit_opacities": logits}), tmp_path / "in.ply")
-    found, matched, seen = [], [], []
-    reduce_rows, match_views = images.reduce_rows, images.match_views
-
-    def noting(job, rows, target, *, importance):
-        reduced = reduce_rows(job, rows, target, importance=importance)
-        found.append((len(rows.scene), target, importance, reduced))
-        return reduced
-
-    def matching(small, observed, targets, **options):
-        matched.append(targets)
-        seen.append(observed.contributions)
-        return match_views(small, observed, targets, **options)
-
-    monkeypatch.setattr(images, "reduce_rows", noting)
-    monkeypatch.setattr(images, "match_views", matching)
-    settings = MATCHED | {"filter": {"min_opacity": 0.1}}
-    report = in_blocks(tmp_path / "in.ply", tmp_path / "out.ply", settings, cameras=ring(10))
-    assert 0 < report.filtered_count < len(scene) // 2
-    assert sum(target for _, target, _, _ in found) == 150
-    for (count, target, importance, reduced), targets, pixels in zip(
-        found, matched, seen, strict=True
-    ):
-        assert len(reduced.scene) == target
-        assert reduced.partition.order.sort().values.tolist() == list(range(count))
-        assert importance.shape == (count,)
-        assert importance.min() < 1.0 < importance.max()
-        wanted = cell_contributions(pixels[-count:], reduced.partition)
-        assert torch.equal(targets[-target:], wanted)
-    largest = max(int(reduced.partition.counts.amax()) for *_, reduced in found)
-    singles = sum(reduced.statistics.single_member_cells for *_, reduced in found)
-    assert (report.largest_cell, report.single_member_cells) == (largest, singles)
+    scene = scene.with_tensors({"logit_opacities": logits})
+    config = SimplifyConfig.from_mapping(MATCHED | {"filter": {"min_opacity": 0.1}})
+    job = unfinished_job(scene, tmp_path, count=150, blocks=BLOCKS, config=config, cameras=ring(10))
+    first, last = job.first, job.last
+    assert sum(first.targets) == sum(last.targets) == 150
+    factors = torch.cat([job.read("factors", block)["factors"] for block in range(BLOCKS)])
+    assert len(factors) == 150
+    assert float(factors.min()) < 1.0 < float(factors.max())
+    counts = []
+    for block in range(BLOCKS):
+        found, report = read_cells(last, block), read_report(last, block)
+        counts.append(len(found.scene))
+        assert report.input_count == counts[-1]
+        assert report.largest_cell == int(found.partition.counts.amax())
+        assert len(cvtgs.load(last.finished_path(block))) == last.targets[block]
+        assert not torch.equal(found.partition.counts, read_cells(first, block).partition.counts)
+    assert sum(counts) == job.read_manifest().grouped < len(scene)
 
 
-def test_members_weigh_again_what_they_show_of_the_mass(source, tmp_path, monkeypatch):
-    """All of the weight comes from images here."""
-    pixels, areas = [], []
-    observe, reduce_rows = images.observe, images.reduce_rows
-
-    def observing(*arguments):
-        views = observe(*arguments)
-        pixels.append(views.contributions)
-        return views
-
-    def noting(job, rows, target, *, importance):
-        areas.append(rows.apparent_areas * rows.scene.opacities)
-        return reduce_rows(job, rows, target, importance=importance)
-
-    monkeypatch.setattr(images, "observe", observing)
-    monkeypatch.setattr(images, "reduce_rows", noting)
-    settings = MATCHED | {"visibility": MATCHED["visibility"] | {"mass_share": 0.0}}
-    in_blocks(source, tmp_path / "out.ply", settings, cameras=ring(10))
-    assert len(areas) == len(pixels) == BLOCKS
-    for masses, seen in zip(areas, pixels, strict=True):
-        own = seen[-len(masses) :].double()
-        torch.testing.assert_close(masses / masses.sum(), own / own.sum(), rtol=1e-3, atol=1e-9)
+def test_masses_in_costs_are_scaled_by_the_factor_of_the_earlier_cell(scene, tmp_path):
+    config = SimplifyConfig.from_mapping(MATCHED)
+    job = unfinished_job(scene, tmp_path, count=150, blocks=BLOCKS, config=config, cameras=ring(10))
+    moved = 0
+    for block in range(BLOCKS):
+        rows = [read_rows_to_merge(one, block) for one in (job.first, job.last)]
+        keys = job.first.read("labels", block)["keys"].tolist()
+        tables = [job.read("factors", key // KEY)["factors"] for key in keys]
+        factors = torch.stack([table[key % KEY] for table, key in zip(tables, keys, strict=True)])
+        assert torch.equal(rows[1].apparent_areas, rows[0].apparent_areas * factors)
+        moved += sum(key // KEY != block for key in keys)
+    assert moved > 0  # cells cross borders
 
 
-def test_a_block_that_images_do_not_show_keeps_its_cells(source, tmp_path, monkeypatch):
-    """Its first result is matched then."""
+def test_blocks_share_the_count_again_by_errors_as_in_one_piece(scene, tmp_path, monkeypatch):
+    """Of two equal objects in all images, images err more in one, which is a block."""
+
+    def errors(drawn, *_):
+        return torch.where(drawn.means[:, 1] > 2, 9.0, 1.0).double()
+
+    def by_view(drawn, observed):
+        return [(errors(drawn), torch.tensor(1.0).double()) for _ in observed.rgb]
+
+    monkeypatch.setattr(cvtgs.rendering, "error_shares", errors)
+    monkeypatch.setattr(image_errors, "errors_by_view", by_view)
+    other = scene.with_tensors({"means": scene.means + torch.tensor([0.0, 4.0, 0.0])})
+    both, cameras = cvtgs.concatenate([scene, other]), ring(10, width=64, height=80, distance=6.0)
+    config = SimplifyConfig.from_mapping(MATCHED)
+    one = Simplifier(config=config, device="cpu").simplify(both, count=150, cameras=cameras)
+    job = unfinished_job(both, tmp_path, count=150, blocks=BLOCKS, config=config, cameras=cameras)
+    counts = []
+    for each in (job.first, job.last):
+        parts = [cvtgs.load(each.small_path(block)) for block in range(BLOCKS)]
+        counts.append(sum(int((part.means[:, 1] > 2).sum()) for part in parts))
+    assert counts[1] > counts[0] + 20
+    assert abs(counts[1] - int((one.means[:, 1] > 2).sum())) <= 8
+
+
+def test_cells_that_images_do_not_show_keep_their_masses(scene, tmp_path, monkeypatch):
     observe = images.observe
 
     def nothing(*arguments):
         views = observe(*arguments)
         return replace(views, contributions=torch.zeros_like(views.contributions))
 
-    def never(*_, **__):
-        raise AssertionError
-
-    monkeypatch.setattr(images, "observe", nothing)
-    monkeypatch.setattr(images, "reduce_rows", never)
-    assert in_blocks(source, tmp_path / "out.ply", MATCHED, cameras=ring(10)).output_count == 150
+    monkeypatch.setattr(image_errors, "observe", nothing)
+    config = SimplifyConfig.from_mapping(MATCHED)
+    job = unfinished_job(scene, tmp_path, count=150, blocks=BLOCKS, config=config, cameras=ring(10))
+    assert job.first.targets == job.last.targets
+    for block in range(BLOCKS):
+        assert bool((job.read("factors", block)["factors"] == 1.0).all())
+        files = [one.small_path(block).read_bytes() for one in (job.first, job.last)]
+        assert files[0] == files[1]
 
 
 def test_blocks_that_keep_all_gaussians_keep_their_cells(source, scene, tmp_path):

@@ -22,7 +22,8 @@ from cvtgs.io.ply import open_rows
 from cvtgs.io.tensors import save_tensors
 from cvtgs.mergenet import load_checkpoint
 from cvtgs.outofcore import simplify_file
-from cvtgs.outofcore.job import Job, can_continue
+from cvtgs.outofcore.folders import can_continue
+from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.memory import LEAST_BYTES
 from cvtgs.outofcore.sort import Attempt
 from cvtgs.streams import stream_file

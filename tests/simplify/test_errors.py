@@ -9,7 +9,7 @@ import cvtgs
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Partition
-from cvtgs.grouping import importance_by_errors
+from cvtgs.grouping import factors_by_errors, factors_of_members
 from cvtgs.matching import mean_squared_error
 from cvtgs.rendering import observe
 from cvtgs.synthetic import scene as make
@@ -105,15 +105,13 @@ def test_a_refinement_and_float64_follow():
 
 
 def test_factors_follow_the_errors_of_a_cell_and_its_neighbours():
-    small = random_scene(30, seed=1)
-    rows = torch.arange(60) % 30
-    cells = Partition.from_labels(rows, 30)
+    means = random_scene(30, seed=1).means
+    cells = Partition.from_labels(torch.arange(60) % 30, 30)
     pixels, errors = torch.full((30,), 1e6), torch.ones(30, dtype=torch.float64)
 
     def factors(errors: torch.Tensor, pixels: torch.Tensor, power: float = 1.0) -> torch.Tensor:
-        return importance_by_errors(
-            small, cells, errors=errors, pixels=pixels, count=62, power=power
-        )
+        found = factors_by_errors(means, errors=errors, pixels=pixels, power=power)
+        return factors_of_members(found, cells, 62)
 
     even = factors(errors, pixels)
     assert even.tolist() == pytest.approx([1.0] * 62)
@@ -141,11 +139,11 @@ def same(one: cvtgs.GaussianScene, other: cvtgs.GaussianScene) -> bool:
 def test_errors_are_those_of_cells_and_not_of_protected_gaussians(monkeypatch):
     scene, seen = make("object", COUNT, sh_degree=0, seed=0), []
 
-    def factors(small, partition, **values):
+    def factors(means, **values):
         seen.append(values["errors"].tolist())
-        return torch.ones(values["count"], dtype=torch.float64)
+        return torch.ones(len(means), dtype=torch.float64)
 
-    monkeypatch.setattr(cvtgs.prepared, "importance_by_errors", factors)
+    monkeypatch.setattr(cvtgs.prepared, "factors_by_errors", factors)
     monkeypatch.setattr(cvtgs.rendering, "error_shares", lambda drawn, _: torch.arange(len(drawn)))
     values = {
         "preset": "matched",
@@ -161,13 +159,10 @@ def test_errors_are_those_of_cells_and_not_of_protected_gaussians(monkeypatch):
 
 def test_factors_of_errors_have_a_geometric_mean_of_one():
     """Of those that images show: the others have a factor near 1 and do not count."""
-    small, part = random_scene(30, seed=1), Partition.from_labels(torch.arange(30), 30)
-    found = importance_by_errors(
-        small,
-        part,
+    found = factors_by_errors(
+        random_scene(30, seed=1).means,
         errors=torch.linspace(1, 3, 30).double(),
         pixels=torch.where(torch.arange(30) < 15, 1e6, 1.0),
-        count=30,
         power=1.0,
     )
     assert float(found.log().sum()) == pytest.approx(0.0, abs=1e-9)

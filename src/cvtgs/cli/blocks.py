@@ -100,7 +100,7 @@ def block_workers(
     """Return workers, None for this process alone, and the bytes of each; clean up on failure."""
     from cvtgs.io.locks import hidden_path
     from cvtgs.outofcore import ClusterWorkers, LocalWorkers, connect
-    from cvtgs.outofcore.job import can_continue, remove_job_files
+    from cvtgs.outofcore.folders import can_continue, remove_job_files
     from cvtgs.outofcore.memory import WORKER_BYTES, worker_count
     from cvtgs.processes import pool_size
 

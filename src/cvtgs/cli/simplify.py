@@ -257,7 +257,7 @@ def _simplify_in_memory(
     listener: ProgressListener,
 ) -> "tuple[cvtgs.SimplifyReport, list[str]]":
     """Read, simplify and save a scene; return the report and notes to print with it."""
-    from cvtgs.outofcore.job import remove_job_files
+    from cvtgs.outofcore.folders import remove_job_files
 
     notes = []
     axes = options.axes

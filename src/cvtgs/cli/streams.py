@@ -191,7 +191,7 @@ def stream_levels(
     options: argparse.Namespace, made: "Sequence[cvtgs.Level]", listener: "cvtgs.ProgressListener"
 ) -> None:
     """Write levels that are in memory as a stream, and print its contents."""
-    from cvtgs.outofcore.job import remove_job_files
+    from cvtgs.outofcore.folders import remove_job_files
     from cvtgs.streams import plan_stream, write_sog_stream, write_tiles
     from cvtgs.streams.plan import CHUNK_GAUSSIANS
 

@@ -21,7 +21,7 @@ from cvtgs.grouping import REASSIGN, allocation_at
 from cvtgs.math.segments import segment_argmax, sort_by_label, take_columns
 from cvtgs.outofcore.halo import number_remote
 from cvtgs.outofcore.images import read_apparent_rows
-from cvtgs.outofcore.job import SENT_BYTES, Job
+from cvtgs.outofcore.job import SENT_BYTES, Job, Step
 from cvtgs.outofcore.rows import BlockRows, send_rows
 
 KEY = 1 << 32  # a global key of a cell or group is its block times this, plus its number there
@@ -52,10 +52,31 @@ def _members(job: Job, rows: BlockRows, components: Tensor | None = None) -> Mom
     )
 
 
+@one_thread()
+def repeat_parts(job: Job, block: int) -> None:
+    """Write the parts of cells again, with the masses by which they are allocated again."""
+    if job.has("parts", block):
+        return
+    first, components = job.first.read("parts", block), job.read_scan().view_components
+    rows = read_rows_to_merge(job, block, is_slim=components.shape[1] == 0)
+    members = _members(job, rows, components)
+    moments = cells.group_moments(members, first["parts"].long(), len(first["masses"]))
+    job.write("parts", block, {**first, **moments._asdict()})
+
+
+def read_rows_to_merge(job: Job, block: int, *, is_slim: bool = True) -> BlockRows:
+    """Read rows with the areas that count in costs of merging: more where images err."""
+    rows = read_apparent_rows(job, block, is_slim=is_slim)
+    if not job.is_again:
+        return rows
+    (factors,) = _take(job, job.first.read("labels", block)["keys"], "factors", step="factors")
+    return rows._replace(apparent_areas=rows.apparent_areas * factors)
+
+
 def allocate(job: Job) -> None:
     """Choose the cells of all blocks that merge, and write the groups of every block."""
     is_done = all(job.has("groups", block) for block in job.blocks_with_sites())
-    if is_done and job.path("targets.json").exists():
+    if is_done and job.targets_path.exists():
         return
     manifest = job.read_manifest()
     cell_counts = [0] * job.blocks  # after Lloyd, which moves some to other blocks
@@ -74,7 +95,7 @@ def allocate(job: Job) -> None:
         found = _allocate_region(job, region, cell_counts, count)
         for block, target in zip(region, found, strict=True):
             targets[block] = target
-    job.write_file("targets.json", json.dumps(targets).encode())
+    job.write_file(job.targets_path.name, json.dumps(targets).encode())
 
 
 def _regions(counts: Sequence[int], room: int) -> list[list[int]]:
@@ -174,15 +195,16 @@ def join(job: Job, block: int) -> None:
     (groups,) = _take(job, owners * KEY + numbers, "groups")
     found = groups[tensors["parts"].long()]
     if job.config.allocation.reassign:
-        rows = read_apparent_rows(job, block)
+        rows = read_rows_to_merge(job, block)
         found = _reassigned(job, block, _members(job, rows), found)
         del rows
+    keys = {"keys": found} if job.allocates_again and not job.is_again else {}
     owners, labels = found // KEY, found % KEY
     owners = torch.where(owners == block, -1, owners)
     sent = send_rows(job, block, owners, labels)
     labels = torch.where(owners < 0, labels, -1).int()
     facts = {SENT_BYTES: str(job.path("sent", block).stat().st_size)}
-    job.write("labels", block, {"labels": labels, "sent": sent}, facts=facts)
+    job.write("labels", block, {"labels": labels, "sent": sent, **keys}, facts=facts)
 
 
 def _reassigned(
@@ -202,14 +224,14 @@ def _reassigned(
     return moved
 
 
-def _take(job: Job, keys: Int[Tensor, "k"], *names: str) -> list[Tensor]:
-    """Read columns of tables in the group files of all blocks, by global key."""
+def _take(job: Job, keys: Int[Tensor, "k"], *names: str, step: Step = "groups") -> list[Tensor]:
+    """Read columns of tables in the files of a step of all blocks, by global key."""
     ascending, inverse = torch.unique(keys, return_inverse=True)
     parts: list[list[Tensor]] = [[] for _ in names]
     blocks, counts = torch.unique_consecutive(ascending // KEY, return_counts=True)
     numbers = (ascending % KEY).split(counts.tolist())
     for block, rows in zip(blocks.tolist(), numbers, strict=True):
-        tensors = job.read("groups", block)
+        tensors = job.read(step, block)
         for name, values in zip(names, parts, strict=True):
             values.append(take_columns(rows, tensors[name]))
     return [take_columns(inverse, torch.cat(values, dim=-1)) for values in parts]

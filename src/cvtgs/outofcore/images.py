@@ -31,15 +31,14 @@ from cvtgs.devices import one_thread
 from cvtgs.edit import concatenate
 from cvtgs.errors import CameraWarning, without_warnings
 from cvtgs.evaluation.blind_views import warn_of_blind
-from cvtgs.grouping import importance_by_errors
 from cvtgs.io import load
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.matching import cell_contributions, match_views
 from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.merge import BlockCells, read_cells, read_report, reduce_rows, write_block
+from cvtgs.outofcore.merge import BlockCells, read_cells, read_report, write_block
 from cvtgs.outofcore.rows import BlockRows, kept_rows, read_rows
 from cvtgs.refinement import refine
-from cvtgs.rendering import ObservedViews, contributions, error_shares, observe
+from cvtgs.rendering import contributions, observe
 from cvtgs.rendering.projection import warn_of_near_plane
 from cvtgs.report import MatchReport, RefineReport
 from cvtgs.scene import GaussianScene
@@ -171,16 +170,11 @@ def improve(job: Job, block: int) -> None:
     if job.finished_path(block).exists():
         return
     own, found, config = load(job.small_path(block)), read_cells(job, block), job.config
-    drawn = _draw(job, block, own, found)
+    drawn = draw(job, block, own, found)
     views, later = _choose_views(job, drawn)
-    changes, observed = dict[str, Any](), None
+    changes, observed, small = dict[str, Any](), None, drawn.small
     if views is not None:
         observed = observe(drawn.full, views)
-        if job.cameras is not None and config.match.error_power > 0.0:
-            own, found, changes = _allocate_again(job, drawn, own, found, observed)
-            drawn = _draw(job, block, own, found)
-    small = drawn.small
-    if observed is not None:
         targets = cell_contributions(observed.contributions[drawn.fixed :], found.partition)
         small, changes["matching"] = match_views(
             small,
@@ -207,36 +201,6 @@ def improve(job: Job, block: int) -> None:
     changes["mass_out"] = float(improved.masses.sum())
     report = read_report(job, block).model_copy(update=changes)
     write_block(job, block, improved, report, is_improved=True)
-
-
-def _allocate_again(
-    job: Job, drawn: Drawn, own: GaussianScene, found: BlockCells, observed: ObservedViews
-) -> tuple[GaussianScene, BlockCells, dict[str, Any]]:
-    """Group a block into cells again, more where its images err; also return changes of its report.
-
-    Unlike in one piece, the new cells stay within the block, so blocks do not wait for each other.
-    """
-    scene, pixels = found.scene, observed.contributions[drawn.fixed :]
-    if not bool(pixels.any()):
-        return own, found, {}
-    importance = importance_by_errors(
-        drawn.small[drawn.fixed :],
-        found.partition,
-        errors=error_shares(drawn.small, observed)[drawn.fixed :],
-        pixels=cell_contributions(pixels, found.partition),
-        count=len(scene),
-        power=job.config.match.error_power,
-    )
-    share = job.config.visibility.mass_share
-    areas = measured_areas(found.apparent_areas, scene.opacities, pixels, share=share)
-    rows = BlockRows(found.original, areas, found.visibility)
-    reduced = reduce_rows(job, rows, len(own), importance=importance)
-    if reduced.partition is None:  # all Gaussians are kept
-        return own, found, {}
-    again = restore_columns(reduced.scene, found.original, job.read_scan().plan)
-    names = ("single_member_cells", "largest_cell")
-    changes = {name: getattr(reduced.statistics, name) for name in names}
-    return again, found._replace(partition=reduced.partition), changes
 
 
 def _choose_views(job: Job, drawn: Drawn) -> tuple[Cameras | None, Cameras | None]:
@@ -278,12 +242,12 @@ def later_views(config: SimplifyConfig) -> int:
 
 def cameras_of_block(cameras: Cameras, members: GaussianScene) -> Cameras:
     """Return the cameras that show a block, whatever hides it, compared with the best of them."""
-    pixels = torch.stack([_pixels_of(members, camera) for camera in cameras.singles()])
+    pixels = torch.stack([pixels_of(members, camera) for camera in cameras.singles()])
     rows = ((pixels > 0) & (pixels >= SHOWS_BLOCK * pixels.max())).nonzero()[:, 0]
     return cameras.select(rows)
 
 
-def _pixels_of(members: GaussianScene, camera: Cameras) -> Float[Tensor, ""]:
+def pixels_of(members: GaussianScene, camera: Cameras) -> Float[Tensor, ""]:
     """Return the opaque area of all Gaussians with centres in an image, pixels."""
     view, intrinsics = camera.viewmats[0].double(), camera.Ks[0].double()
     local = members.means.double() @ view[:3, :3].T + view[:3, 3]
@@ -296,7 +260,7 @@ def _pixels_of(members: GaussianScene, camera: Cameras) -> Float[Tensor, ""]:
     return (members.opacities[is_inside] * areas.clamp_max(most)).sum()
 
 
-def _draw(job: Job, block: int, own: GaussianScene, found: BlockCells) -> Drawn:
+def draw(job: Job, block: int, own: GaussianScene, found: BlockCells) -> Drawn:
     """Read the other simplified blocks, and build the scenes to render."""
     plan = job.read_scan().plan
     own, members = _bare(job, own, plan), _bare(job, found.scene, plan)

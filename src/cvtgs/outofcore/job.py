@@ -1,15 +1,14 @@
-"""The job of an out-of-core run: all data that a process needs, and its folder of block files."""
+"""The job of an out-of-core run: all data that a process needs, and the files of its blocks."""
 
 import hashlib
 import json
 import os
 import shutil
 import zlib
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Literal, Self, get_args
 
 import torch
 from torch import Tensor
@@ -17,25 +16,21 @@ from torch import Tensor
 import cvtgs
 from cvtgs.boxes import Box
 from cvtgs.cameras import Cameras
-from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
-from cvtgs.errors import CvtgsError, InputError, OutputError, reason_of
+from cvtgs.errors import CvtgsError
 from cvtgs.io.atomic import write_atomically
 from cvtgs.io.axes import SCENE_AXES
-from cvtgs.io.files import is_file, is_folder
-from cvtgs.io.locks import hidden_path, lock_path, output_lock
 from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors, save_tensors
-from cvtgs.mergenet import Checkpoint, Net, encode_checkpoint, load_checkpoint
-from cvtgs.outofcore.memory import CELL_ROOM, joint_cells, step_bytes, warn_of_full_disk
+from cvtgs.mergenet import Checkpoint, Net, load_checkpoint
+from cvtgs.outofcore.memory import CELL_ROOM, joint_cells, step_bytes
 from cvtgs.outofcore.scan import SAMPLE_ROWS, SceneScan, read_scan, write_scan
-from cvtgs.processes import Workers
 
 SENT_BYTES = "sent_bytes"  # entry of the label file of a block: bytes of the file of its sent rows
 
 
-FILES_VERSION = 11
+FILES_VERSION = 12
 """Number of the layout of these files: raise it with every change, so that no run continues with
 files of another layout."""
 
@@ -49,8 +44,13 @@ Step = Literal[
     "labels",  # the own group of every row, and the row counts sent to blocks
     "merged",  # the merged Gaussians of a block
     "inflated",  # the merged Gaussians after inflation, and the neighbours of each
+    "errors",  # the error of images by the Gaussians of a simplified block, and their pixels
+    "factors",  # by which these errors scale the masses of the cells of a block
 ]
 """First word of the name of a tensor file, which one step writes and later ones read."""
+
+REPEATED = ("parts", "groups", "targets", "labels", "sent", "merged", "inflated", "small")
+"""First words of the names of files that exist twice if cells are allocated again."""
 
 
 class Manifest(Record):
@@ -78,10 +78,13 @@ class Job:
     cell_room: int = CELL_ROOM  # cells that may merge together in one process
     axes: str = SCENE_AXES  # directions of x, y and z in the output
     cameras: Cameras | None = None  # for presets that render the scene; None generates views
+    is_again: bool = False  # whether cells are allocated the second time, by errors of images
 
     def path(self, name: str, *numbers: int | None, suffix: str = "") -> Path:
         """Return the path of a file of the job, by its name and numbers such as that of a block."""
-        parts = [name, *(f"{number:05d}" for number in numbers if number is not None)]
+        again = ["again"] if self.is_again and name in REPEATED else []
+        digits = [f"{number:05d}" for number in numbers if number is not None]
+        parts = [name, *again, *digits]
         return Path(self.folder) / ("_".join(parts) + suffix)
 
     def has(self, step: Step, block: int, iteration: int | None = None) -> bool:
@@ -112,7 +115,13 @@ class Job:
     def file_bytes(self) -> int:
         """Estimate of the bytes of all files of the job, when they take most, and of the output."""
         cells = joint_cells(self.target, self.source.count, self.cell_room, self.config.allocation)
-        return step_bytes(self.source, cells=cells, kept=self.target)
+        rounds = 2 if self.allocates_again else 1
+        return step_bytes(self.source, cells=cells, kept=self.target, rounds=rounds)
+
+    @property
+    def targets_path(self) -> Path:
+        """The file of the number of Gaussians that each block keeps."""
+        return self.path("targets", suffix=".json")
 
     @property
     def views_path(self) -> Path:
@@ -132,6 +141,22 @@ class Job:
         """Whether blocks are matched to images of the scene, or refined."""
         config = self.config
         return (config.uses_renders and config.match.enabled) or config.refine.enabled
+
+    @property
+    def allocates_again(self) -> bool:
+        """Whether cells are allocated a second time, by the errors of images of given cameras."""
+        is_given = self.config.uses_renders and self.cameras is not None
+        return is_given and self.config.match.error_power > 0.0
+
+    @property
+    def first(self) -> Self:
+        """The job as its cells are allocated the first time."""
+        return replace(self, is_again=False)
+
+    @property
+    def last(self) -> Self:
+        """The job as its cells are allocated the last time."""
+        return replace(self, is_again=self.allocates_again)
 
     @property
     def goes_by_steps(self) -> bool:
@@ -157,7 +182,7 @@ class Job:
         """Number of Gaussians that each block keeps; known once the groups are."""
         if not self.goes_by_steps:
             return (self.read_manifest().total,)
-        return tuple(json.loads(self.path("targets.json").read_bytes()))
+        return tuple(json.loads(self.targets_path.read_bytes()))
 
     def blocks_with_sites(self) -> list[int]:
         """Return the blocks in which the tessellation has sites."""
@@ -266,23 +291,30 @@ class Job:
                     facts = map_tensors(path)[1]  # Windows does not remove mapped files
                     whole = True
                     if SENT_BYTES in facts:
-                        block = int(path.name.removeprefix("labels_"))
-                        whole = self.path("sent", block).stat().st_size == int(facts[SENT_BYTES])
+                        sent = path.with_name(path.name.replace("labels", "sent"))
+                        whole = sent.stat().st_size == int(facts[SENT_BYTES])
                 except (CvtgsError, OSError):
                     whole = False
                 if not whole:
                     path.unlink(missing_ok=True)
+        for job in [self.first, self.last] if self.allocates_again else [self]:
+            job._remove_damaged_blocks()
+
+    def _remove_damaged_blocks(self) -> None:
         try:
             blocks = self.blocks_with_cells()
         except (OSError, ValueError, TypeError):  # blocks cannot be checked without it
-            for pattern in ("targets.json", "small_*", "improved_*"):
-                for path in self.path("").glob(pattern):
-                    path.unlink()
+            paths = [self.targets_path]
+            paths += [self.small_path(block) for block in range(self.blocks)]
+            paths += [self.finished_path(block) for block in range(self.blocks)]
+            for path in paths:
+                path.unlink(missing_ok=True)
             return
+        is_last = self.is_again == self.allocates_again
         for block in blocks:
             whole = True
             # The report of a small block that is made again would lack what its images changed.
-            for name in (self.small_path(block), self.finished_path(block)):
+            for name in (self.small_path(block), *([self.finished_path(block)] if is_last else [])):
                 try:
                     json.loads(self.report_path(block).read_bytes())
                     whole = whole and open_rows(name).count == self.targets[block]
@@ -290,100 +322,3 @@ class Job:
                     whole = False
                 if not whole:
                     name.unlink(missing_ok=True)
-
-
-AnyJob = TypeVar("AnyJob", bound=Job)
-
-SIZES = ("blocks", "sample_rows", "cell_room")  # attributes of a job that its memory decides
-
-
-@contextmanager
-def started(
-    job: Job, workers: Workers, clock: StageClock, checkpoint: Checkpoint | None, *, resumes: bool
-) -> Iterator[None]:
-    """Make the folder of a job, unless it resumes; check the workers, and write the network.
-
-    The body sorts the rows; if it fails or the source changes meanwhile, the folder is removed.
-    """
-    before = _stamp(job.source.path)
-    try:
-        if not resumes:
-            _make_empty(Path(job.folder))
-            sizes = {name: getattr(job, name) for name in SIZES}
-            job.write_file("sizes.json", json.dumps(sizes).encode())
-            warn_of_full_disk(job.folder, job.file_bytes)
-        check: Callable[[Job], object] | None = getattr(workers, "check", None)
-        if check is not None:  # workers on other machines
-            with clock.stage("workers"):
-                check(job)
-        if checkpoint is not None:  # a resumed job may find it damaged
-            content = encode_checkpoint(checkpoint.net, checkpoint.info)
-            job.write_file("network.safetensors", content)
-        yield
-        if not resumes and _stamp(job.source.path) != before:
-            raise InputError(
-                f"{job.source.path}: must stay as it is while it is read, found it changed; start "
-                "again."
-            )
-    except BaseException:
-        if not resumes:
-            shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
-        raise
-
-
-def _make_empty(folder: Path) -> None:
-    """Make an empty folder; remove files that earlier jobs of this output left."""
-    shutil.rmtree(folder.parent, ignore_errors=True)
-    try:
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise OutputError(
-            f"{folder.parent}: must be replaceable by an empty folder for block files, "
-            f"found: {reason_of(error)}."
-        ) from error
-
-
-def _stamp(path: str) -> tuple[int, int] | None:
-    """Return size and time of a file; None if it does not exist any more."""
-    try:
-        stat = Path(path).stat()
-    except OSError:
-        return None
-    return stat.st_size, stat.st_mtime_ns
-
-
-def in_folder(
-    job: AnyJob, output: str | os.PathLike[str], checkpoint: Checkpoint | None, *, adapts: bool
-) -> AnyJob:
-    """Return a job with its folder, which is named by its key: late workers use that of their job.
-
-    One that adapts gets the sizes of an interrupted run of it, unless that needs more memory.
-    """
-    parent = hidden_path(output, "blocks")
-    for path in parent.glob("*/sizes.json") if adapts else ():
-        try:
-            found = json.loads(path.read_bytes())
-            sizes: dict[str, Any] = {name: int(found[name]) for name in SIZES}
-            earlier = replace(job, **sizes)
-        except (OSError, ValueError, KeyError, TypeError):
-            continue
-        fits = earlier.blocks >= job.blocks and earlier.sample_rows <= job.sample_rows
-        fits = fits and earlier.cell_room <= job.cell_room
-        if fits and earlier.key(checkpoint)[:16] == path.parent.name:
-            job = earlier
-            break
-    return replace(job, folder=str(parent / job.key(checkpoint)[:16]))
-
-
-def can_continue(output: str | os.PathLike[str]) -> bool:
-    """Return whether an interrupted run of an output has rows to continue with."""
-    return any(hidden_path(output, "blocks").glob("*/sorted.json"))
-
-
-def remove_job_files(output: str | os.PathLike[str], *, is_stream: bool = False) -> None:
-    """Remove the files that interrupted runs of an output left, unless another run uses them."""
-    folder = hidden_path(output, "blocks")
-    locked = folder if is_stream else output  # commands lock the output of a stream
-    if is_folder(folder) or is_file(lock_path(locked)):
-        with suppress(OutputError), output_lock(locked):
-            shutil.rmtree(folder, ignore_errors=True)

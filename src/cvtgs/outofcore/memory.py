@@ -237,10 +237,14 @@ def stream_bytes(source: PlyRows, gaussians: int) -> int:
     return sorted_bytes(source) + gaussians * source.dtype.itemsize // STREAM_PART
 
 
-def step_bytes(source: PlyRows, *, cells: int, kept: int) -> int:
-    """Estimate the bytes of the files of all steps; cells cross the borders of blocks."""
+def step_bytes(source: PlyRows, *, cells: int, kept: int, rounds: int = 1) -> int:
+    """Estimate the bytes of the files of all steps; cells cross the borders of blocks.
+
+    Those of the tessellation and of the cells exist once in every of ``rounds`` allocations.
+    """
     results = kept * (RESULTS * source.dtype.itemsize + GROUP_BYTES)
-    return sorted_bytes(source) + source.count * POINT_BYTES + cells * JOINT_BYTES + results
+    files = source.count * POINT_BYTES + cells * JOINT_BYTES + results
+    return sorted_bytes(source) + rounds * files
 
 
 def warn_of_full_disk(folder: str, needed: int) -> None:

@@ -19,9 +19,8 @@ from cvtgs.io.tensors import add_prefix, under_prefix
 from cvtgs.mergenet import correct_cells
 from cvtgs.outofcore.halo import bounding_box, halo_cells, other_blocks
 from cvtgs.outofcore.job import Job, Step
-from cvtgs.outofcore.rows import BlockRows, analysis_of, read_members, read_rows
+from cvtgs.outofcore.rows import analysis_of, read_members, read_rows
 from cvtgs.pipeline import (
-    Reduced,
     merge_members,
     moved_back,
     moved_from,
@@ -50,7 +49,6 @@ class BlockCells(NamedTuple):
 
     original: GaussianScene
     scene: GaussianScene
-    apparent_areas: Float[Tensor, "n"]
     visibility: Float[Tensor, "n"]
     partition: cells.Partition
 
@@ -110,7 +108,7 @@ def correct(job: Job, block: int) -> None:
     """Correct the cells of a block with the network, if there is one, and write the block."""
     if job.small_path(block).exists():
         return
-    original, scene, _, visibility, partition = read_cells(job, block)
+    original, scene, visibility, partition = read_cells(job, block)
     scan = job.read_scan()
     origin = scan.frame.far_origin(scene.means)
     own = job.read("inflated", block)
@@ -151,7 +149,17 @@ def simplify_block(job: Job, block: int) -> None:
     if job.small_path(block).exists():
         return
     rows, scan = read_rows(job, block), job.read_scan()
-    reduced = reduce_rows(job, rows, job.targets[block])
+    scene = select_columns(rows.scene, job.config.effects)
+    no_filter = {"min_opacity": 0.0, "max_flyaway_share": 0.0}  # the sort has filtered the rows
+    filter_config = job.config.filter.model_copy(update=no_filter)
+    reduced = reduce_scene(
+        scene,
+        analysis_of(scan, rows._replace(scene=scene)),
+        job.targets[block],
+        job.config.model_copy(update={"filter": filter_config}),
+        net=job.read_network(scene.dtype),
+        clock=StageClock(silent, scene.device),
+    )
     report = BlockReport(
         input_count=len(rows.scene),
         mass_out=float(reduced.scene.masses.sum()),
@@ -160,31 +168,13 @@ def simplify_block(job: Job, block: int) -> None:
     write_block(job, block, restore_columns(reduced.scene, rows.scene, scan.plan), report)
 
 
-def reduce_rows(
-    job: Job, rows: BlockRows, target: int, *, importance: Float[Tensor, "n"] | None = None
-) -> Reduced:
-    """Simplify rows, which the sort has filtered, like a scene of their own."""
-    scene = select_columns(rows.scene, job.config.effects)
-    no_filter = {"min_opacity": 0.0, "max_flyaway_share": 0.0}
-    filter_config = job.config.filter.model_copy(update=no_filter)
-    return reduce_scene(
-        scene,
-        analysis_of(job.read_scan(), rows._replace(scene=scene)),
-        target,
-        job.config.model_copy(update={"filter": filter_config}),
-        net=job.read_network(scene.dtype),
-        clock=StageClock(silent, scene.device),
-        importance=importance,
-    )
-
-
 def read_cells(job: Job, block: int) -> BlockCells:
     """Read the Gaussians in the cells of a block."""
     rows, labels = read_members(job, block)
     used = select_columns(rows.scene, job.config.effects)
     scene = drop_unused_bands(used, job.read_scan().plan)
     partition = cells.Partition.from_labels(labels, job.targets[block])
-    return BlockCells(rows.scene, scene, rows.apparent_areas, rows.visibility, partition)
+    return BlockCells(rows.scene, scene, rows.visibility, partition)
 
 
 def _with_halo(
@@ -214,7 +204,7 @@ def write_block(
 ) -> None:
     """Write a finished block; its report comes first, since the scene file marks it as finished."""
     path = job.finished_path(block) if is_improved else job.small_path(block)
-    axes = job.axes if path == job.finished_path(block) else SCENE_AXES
+    axes = job.axes if path == job.last.finished_path(block) else SCENE_AXES
     job.write_file(job.report_path(block).name, report.model_dump_json().encode())
     with without_warnings():
         save(small, path, overwrite=True, axes=axes)

@@ -2,8 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from cvtgs.analysis import restore_columns
@@ -23,18 +22,9 @@ from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES, checked_axes
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import PlyRows, join_plys, open_rows
-from cvtgs.outofcore.allocate import allocate, join
-from cvtgs.outofcore.images import (
-    LEAST_CAMERAS,
-    add_contributions,
-    improve,
-    join_matchings,
-    join_refinements,
-    measure,
-    warn_of_blind_cameras,
-)
-from cvtgs.outofcore.job import Job, Manifest, in_folder, started
-from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
+from cvtgs.outofcore.folders import in_folder, started
+from cvtgs.outofcore.images import LEAST_CAMERAS, join_matchings, join_refinements
+from cvtgs.outofcore.job import Job, Manifest
 from cvtgs.outofcore.memory import (
     IMAGE_BYTES,
     cell_room,
@@ -46,12 +36,13 @@ from cvtgs.outofcore.memory import (
     sample_rows,
     warn_of_writing,
 )
-from cvtgs.outofcore.merge import correct, inflate, merge, read_report, simplify_block
+from cvtgs.outofcore.merge import read_report
 from cvtgs.outofcore.rows import kept_rows
 from cvtgs.outofcore.scan import CHUNK, read_sample
 from cvtgs.outofcore.sort import sort_into_blocks
+from cvtgs.outofcore.steps import run_steps
 from cvtgs.prepared import check_cameras
-from cvtgs.processes import Result, Workers, with_progress
+from cvtgs.processes import Workers
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.rendering.projection import warn_of_near_plane
 from cvtgs.report import SimplifyReport, origin_of_views
@@ -187,8 +178,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
                 with one_thread():
                     manifest = _scan_and_sort(job, workers, clock)
                 job.write_file("manifest.json", manifest.to_json().encode())
-        energies = _group(job, workers, clock) if job.goes_by_steps else ()
-        resumed, is_complete = _run_blocks(job, workers, clock), False
+        (energies, resumed), is_complete = run_steps(job, workers, clock), False
+        job = job.last
         try:
             with clock.stage("assemble"):
                 assemble_blocks(job, output, axes=output_axes, overwrite=overwrite)
@@ -250,56 +241,6 @@ def _scan_and_sort(job: Job, workers: Workers, clock: StageClock) -> Manifest:
     return Manifest(
         grouped=total, total=found.rest, cells=tuple(cells), left_out_mass=found.left_out_mass
     )
-
-
-def _run_blocks(job: Job, workers: Workers, clock: StageClock) -> int:
-    """Simplify the unfinished blocks; return how many were already finished."""
-    with_cells = job.blocks_with_cells()
-    resumed = sum(job.finished_path(block).exists() for block in with_cells)
-    steps: dict[str, Callable[[Job, int], None]] = {"blocks": simplify_block}
-    if job.goes_by_steps:
-        steps = {"merge": merge, "inflate": inflate, "blocks": correct}
-    if job.uses_images:
-        steps["images"] = improve
-    for name, step in steps.items():
-        with clock.stage(name, len(with_cells)) as advance:
-            if step is improve:
-                warn_of_blind_cameras(job)
-            list(with_progress(workers(partial(step, job), with_cells), advance))
-    return resumed
-
-
-def _group(job: Job, workers: Workers, clock: StageClock) -> tuple[float, ...]:
-    """Group the Gaussians of all blocks into cells; return the energy before every iteration.
-
-    Each step runs for all blocks before the next, so the result has no seams.
-    """
-    blocks, iterations = job.blocks_with_rows(), job.config.cvt.iterations
-    if job.config.uses_renders:
-        with clock.stage("visibility", len(blocks)) as advance:
-            list(with_progress(workers(partial(measure, job), blocks), advance))
-            add_contributions(job)
-    with clock.stage("tessellate", (iterations + 2) * len(blocks)) as advance:
-
-        def run(step: Callable[[int], Result], nth: int) -> list[Result]:
-            first = nth * len(blocks)
-            results = workers(step, blocks)
-            return list(with_progress(results, lambda done: advance(first + done)))
-
-        run(partial(seed, job), 0)
-        moves, energies, least = 0, [math.inf], 1.0 - job.config.cvt.tolerance
-        for iteration in range(iterations):
-            found = run(partial(accumulate, job, iteration), iteration + 1)
-            energies.append(math.fsum(found))  # `sum` rounds differently from Python 3.12 on
-            if energies[-1] >= least * energies[-2]:
-                break
-            move_sites(job, iteration)
-            moves = iteration + 1
-        run(partial(assign, job, moves), iterations + 1)
-    with clock.stage("allocate", len(blocks)) as advance:
-        allocate(job)
-        list(with_progress(workers(partial(join, job), blocks), advance))
-    return tuple(energies[1:])
 
 
 def assemble_blocks(

@@ -5,12 +5,12 @@ are imported only when chosen.
 """
 
 from cvtgs.rendering.backends import BackendName, BlendingWeights, choose_backend
+from cvtgs.rendering.image_errors import error_shares
 from cvtgs.rendering.render import (
     ObservedViews,
     Rendering,
     blending_weights,
     contributions,
-    error_shares,
     observe,
     render,
 )

@@ -30,7 +30,8 @@ from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
 from cvtgs.mergenet import Checkpoint
 from cvtgs.outofcore import Workers
-from cvtgs.outofcore.job import Job, in_folder, started
+from cvtgs.outofcore.folders import in_folder, started
+from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.memory import (
     check_memory,
     chosen_blocks,
