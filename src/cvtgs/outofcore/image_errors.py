@@ -37,7 +37,8 @@ def measure_errors(job: Job, block: int) -> None:
         observed = observe(drawn.full, cameras.select(shown))
         pixels = cell_contributions(observed.contributions[drawn.fixed :], found.partition)
         errors = errors_by_view(drawn.small, observed)
-        for view, (values, sums[view]) in zip(shown, errors, strict=True):
+        for view, (values, mean) in zip(shown, errors, strict=True):
+            sums[view] = mean
             rows = ((values > 0) & (cells >= 0)).nonzero()[:, 0]
             shares.append((cells[rows], values[rows], view.expand(len(rows))))
     columns = [torch.cat(parts) for parts in zip(*shares, strict=True)]
@@ -48,8 +49,9 @@ def measure_errors(job: Job, block: int) -> None:
 
 def _numbers_of_cells(job: Job, block: int, drawn: Drawn) -> Int[Tensor, "n"]:
     """Return the number among the cells of all blocks of each that is drawn; -1 if protected."""
-    start, own = sum(job.targets[:block]), job.targets[block]
-    numbers = torch.arange(sum(job.targets))
+    targets = job.targets
+    start, own = sum(targets[:block]), targets[block]
+    numbers = torch.arange(sum(targets))
     others = torch.cat([numbers[:start], numbers[start + own :]])
     protected = torch.full((drawn.fixed - len(others),), -1)
     return torch.cat([protected, others, numbers[start : start + own]])
@@ -67,7 +69,7 @@ def compare_errors(job: Job) -> None:
     )
     power, errors = job.config.match.error_power, _joined_errors(job)
     factors = factors_by_errors(means, errors=errors, pixels=pixels, power=power)
-    counts = [job.targets[block] for block in blocks]
+    counts = [count for count in job.targets if count]
     for block, own in zip(blocks, factors.split(counts), strict=True):
         job.write("factors", block, {"factors": own})
 

@@ -40,6 +40,7 @@ def error_shares(
         MissingDependencyError: The backend's package is missing.
 
     Example:
+        >>> from cvtgs.rendering import observe
         >>> from cvtgs.synthetic import scene as make
         >>> from cvtgs.views import automatic_views
         >>> scene = make("object", 500, sh_degree=0, seed=0)
