@@ -48,6 +48,7 @@ def main() -> None:
     parser.add_argument("--blocks", default="4,16", help="numbers of blocks to compare")
     parser.add_argument("--presets", default="standard", help="presets to compare by blocks")
     parser.add_argument("--fit", type=int, default=0, help="number of cameras to give to presets")
+    parser.add_argument("--by-given", action="store_true", help="score by the given cameras")
     parser.add_argument("--exact", action="store_true", help="compare at the ratio alone")
     parser.add_argument("--stream", action="store_true", help="compare streams by blocks")
     parser.add_argument(
@@ -111,6 +112,7 @@ def seams(options: argparse.Namespace) -> None:
         seen_scenes(options), options.presets.split(",")
     ):
         given = spread_cameras(scene, options.fit) if options.fit else None
+        views = given if given is not None and options.by_given else cameras
         simplifier = cvtgs.Simplifier(preset=preset, device="cpu")
         found: dict[int, list[cvtgs.GaussianScene]] = {number: [] for number in numbers}
         with tempfile.TemporaryDirectory() as folder:
@@ -130,7 +132,7 @@ def seams(options: argparse.Namespace) -> None:
                     overwrite=True,
                 )  # fmt: skip
                 found[number].append(cvtgs.load(output))
-        psnr, ssim = zip(*(scores(scene, found[n], cameras) for n in numbers), strict=True)
+        psnr, ssim = zip(*(scores(scene, found[n], views) for n in numbers), strict=True)
         words = [f"{psnr[0]:.2f} ({ssim[0]:.4f}) |"]
         for one, other in zip(psnr[1:], ssim[1:], strict=True):
             words.append(f"{difference(one, psnr[0]):+.2f} ({other - ssim[0]:+.4f}) |")

@@ -31,19 +31,21 @@ def measure_errors(job: Job, block: int) -> None:
     cameras = visibility_cameras(found.scene, job.config, cameras=job.cameras)
     reached = torch.stack([pixels_of(found.scene, camera) for camera in cameras.singles()])
     shown, sums = (reached > 0).nonzero()[:, 0], torch.zeros(len(cameras), dtype=torch.float64)
-    pixels, cells = torch.zeros(len(own)), _numbers_of_cells(job, block, drawn)
-    shares = [(cells[:0], sums[:0], cells[:0])]
+    pixels, counts = torch.zeros(len(own)), torch.zeros(len(cameras), dtype=torch.int64)
+    numbers = _numbers_of_cells(job, block, drawn)
+    cells, shares = [numbers[:0]], [pixels[:0]]
     if len(shown):
         observed = observe(drawn.full, cameras.select(shown))
         pixels = cell_contributions(observed.contributions[drawn.fixed :], found.partition)
         errors = errors_by_view(drawn.small, observed)
         for view, (values, mean) in zip(shown, errors, strict=True):
-            sums[view] = mean
-            rows = ((values > 0) & (cells >= 0)).nonzero()[:, 0]
-            shares.append((cells[rows], values[rows], view.expand(len(rows))))
-    columns = [torch.cat(parts) for parts in zip(*shares, strict=True)]
-    tensors = {"means": own.means, "pixels": pixels, "sums": sums}
-    tensors |= {"cells": columns[0].int(), "shares": columns[1].float(), "views": columns[2].int()}
+            rows = ((values > 0) & (numbers >= 0)).nonzero()[:, 0]
+            sums[view], counts[view] = mean, len(rows)
+            cells.append(numbers[rows])
+            shares.append(values[rows].float())
+    of_views = {"sums": sums, "counts": counts}
+    of_cells = {"cells": torch.cat(cells), "shares": torch.cat(shares)}
+    tensors = {"means": own.means, "pixels": pixels, **of_views, **of_cells}
     job.write("errors", block, tensors)
 
 
@@ -51,9 +53,9 @@ def _numbers_of_cells(job: Job, block: int, drawn: Drawn) -> Int[Tensor, "n"]:
     """Return the number among the cells of all blocks of each that is drawn; -1 if protected."""
     targets = job.targets
     start, own = sum(targets[:block]), targets[block]
-    numbers = torch.arange(sum(targets))
+    numbers = torch.arange(sum(targets), dtype=torch.int32)
     others = torch.cat([numbers[:start], numbers[start + own :]])
-    protected = torch.full((drawn.fixed - len(others),), -1)
+    protected = numbers.new_full((drawn.fixed - len(others),), -1)
     return torch.cat([protected, others, numbers[start : start + own]])
 
 
@@ -80,6 +82,6 @@ def _joined_errors(job: Job) -> Float[Tensor, "m"]:
     sums = torch.stack([part["sums"] for part in parts]).sum(dim=0).clamp_min(LEAST_ERROR)
     errors = torch.zeros(sum(job.targets), dtype=torch.float64)
     for part in parts:
-        shares = part["shares"] / sums[part["views"].long()]
-        errors.index_add_(0, part["cells"].long(), shares)
+        shares = part["shares"] / sums.repeat_interleave(part["counts"])
+        errors.index_add_(0, part["cells"], shares)
     return errors

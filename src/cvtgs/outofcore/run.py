@@ -178,8 +178,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
                 with one_thread():
                     manifest = _scan_and_sort(job, workers, clock)
                 job.write_file("manifest.json", manifest.to_json().encode())
-        (energies, resumed), is_complete = run_steps(job, workers, clock), False
-        job = job.last
+        energies, resumed = run_steps(job, workers, clock)
+        job, is_complete = job.last, False
         try:
             with clock.stage("assemble"):
                 assemble_blocks(job, output, axes=output_axes, overwrite=overwrite)
