@@ -38,6 +38,15 @@ def test_names_may_be_as_long_as_the_system_allows() -> None:
     assert len(json.loads(Path("report.json").read_text())) == 3
 
 
+def test_a_failed_run_removes_the_folder_that_a_link_leads_to() -> None:
+    Path("out").symlink_to(Path("../real"))
+    assert main([*RUN, "--quiet", "--keep", "none.json"]) == 1
+    assert not Path("out").exists()
+    assert main([*RUN, "--quiet"]) == 0
+    assert written() == ["a.ply", "b.ply", "c.ply"]
+    assert Path("out").is_symlink()
+
+
 @pytest.mark.parametrize(
     "words", [RUN, ("convert", ".", "-o", "out", "--suffix", ".splat")], ids=lambda words: words[0]
 )
@@ -52,8 +61,8 @@ def test_another_run_may_remove_the_empty_folder_meanwhile(
             Path("out").rmdir()
         return read(*arguments, **options)  # type: ignore[arg-type]
 
+    monkeypatch.setattr(cvtgs, "load", read_and_remove)  # which is looked up in cvtgs.io once
     monkeypatch.setattr(cvtgs.io, "load", read_and_remove)
-    monkeypatch.setattr(cvtgs, "load", read_and_remove)
     assert main([*words, "--quiet"]) == 0
     assert len(written()) == 3
 

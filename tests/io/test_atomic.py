@@ -84,6 +84,18 @@ def test_symbolic_links_are_followed_and_kept(tmp_path: Path) -> None:
     assert list((tmp_path / "real").iterdir()) == [target]
 
 
+def test_links_to_folders_that_do_not_exist_are_followed(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    (tmp_path / "file").write_bytes(b"")
+    (tmp_path / "link.bin").symlink_to("file")
+    atomic.check_outputs(tmp_path / "link" / "inner", ["a.bin"])
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / "inner").is_dir()
+    for name in ("file", "link.bin"):
+        with pytest.raises(OutputError, match=f"{name}: must be a folder or a new path"):
+            atomic.check_outputs(tmp_path / name, ["a.bin"])
+
+
 def refuse(*args: object) -> NoReturn:
     raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
 
