@@ -9,7 +9,7 @@ import pytest
 
 import cvtgs
 from cvtgs.cli.main import main
-from cvtgs.errors import OutOfMemoryError
+from cvtgs.errors import InputError, OutOfMemoryError
 
 RUN = ("simplify", ".", "-o", "out", "--rho", "0.1", "--preset", "draft")
 
@@ -104,6 +104,26 @@ def test_the_report_has_the_scenes_before_an_interrupt(monkeypatch: pytest.Monke
         main([*RUN, "--report", "report.json", "--quiet"])
     entries = json.loads(Path("report.json").read_text())
     assert [entry["output"] for entry in entries] == [f"out{os.sep}a.ply", f"out{os.sep}b.ply"]
+
+
+def test_a_report_that_fails_too_does_not_replace_the_first_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    load = cvtgs.io.load
+
+    def load_and_take_the_name(path: Path, **options: object) -> cvtgs.GaussianScene:
+        Path("report.json").write_text("of another run")
+        if path.name == "b.ply":
+            raise InputError("b.ply: damaged.")
+        return load(path, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(cvtgs.io, "load", load_and_take_the_name)
+    assert main([*RUN, "--report", "report.json", "--quiet"]) == 1
+    damaged, report, last = capsys.readouterr().err.splitlines()
+    assert damaged == "cvtgs: error: [2/3] b.ply: damaged."
+    assert report.startswith("cvtgs: warning: report.json: the output must not exist yet")
+    assert report.endswith("; the scenes in out were written, the report was not.")
+    assert last == "cvtgs: error: 1 of 3 scenes failed; 2 are in out."
 
 
 def test_a_folder_without_a_scene_does_not_stop_the_others(

@@ -175,12 +175,20 @@ def simplify(options: argparse.Namespace) -> None:
                 keep(job, report=json.loads(report.to_json()))
             return outcome
 
-        try:
-            run_jobs(jobs, work, failed=lambda job, error: keep(job, error=str(error)))
-        finally:  # also if some of many scenes failed, or after an interrupt
+        def write_entries() -> None:
             if entries:
                 text = json.dumps(entries, indent=2) + "\n"
                 _write_report(options, text, f"the scenes in {options.folder} were")
+
+        try:
+            run_jobs(jobs, work, failed=lambda job, error: keep(job, error=str(error)))
+        except BaseException:  # some of many scenes failed, or an interrupt
+            try:
+                write_entries()
+            except OutputError as error:
+                warn(str(error))  # the first error is the one to report
+            raise
+        write_entries()
 
 
 def _write_report(options: argparse.Namespace, text: str, written: str) -> None:
