@@ -36,6 +36,7 @@ def drop(*keys: Any) -> Callable[[Any], None]:
 BIGGER = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
 MIRROR = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 BY_COLUMNS = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [3, 4, 5, 1]]
+UNDISTORT = "for others, use colmap image_undistorter first, and give the folder that it writes"
 MATRIX = "frame 2: 'transform_matrix' must be 4 x 4 or 3 x 4 finite numbers, found "
 
 TRANSFORMS: Mapping[str, tuple[Callable[[Any], None], str]] = {
@@ -107,15 +108,17 @@ TRANSFORMS: Mapping[str, tuple[Callable[[Any], None], str]] = {
     "fisheye": (
         put("camera_model", value="OPENCV_FISHEYE"),
         " 'camera_model' must be one of PINHOLE, SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, "
-        "FULL_OPENCV, PERSPECTIVE, found 'OPENCV_FISHEYE'.",
+        f"FULL_OPENCV, PERSPECTIVE ({UNDISTORT}), found 'OPENCV_FISHEYE'.",
     ),
     "fisheye of instant-ngp": (
         put("is_fisheye", value=True),
-        " 'is_fisheye' must be false, since rendering uses pinhole cameras, found True.",
+        " 'is_fisheye' must be false, since rendering uses pinhole cameras "
+        f"({UNDISTORT}), found True.",
     ),
     "fisheye of a frame": (
         put("frames", 2, "is_fisheye", value=True),
-        " frame 2: 'is_fisheye' must be false, since rendering uses pinhole cameras, found True.",
+        " frame 2: 'is_fisheye' must be false, since rendering uses pinhole cameras "
+        f"({UNDISTORT}), found True.",
     ),
     "text for distortion": (
         put("distortion_params", value=[0.1, "x"]),

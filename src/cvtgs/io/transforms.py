@@ -28,6 +28,7 @@ from cvtgs.text import shown
 _PinholeModel = Literal[
     "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE"
 ]
+_UNDISTORT = "for others, use colmap image_undistorter first, and give the folder that it writes"
 _DISTORTIONS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 _PNG_START = struct.Struct(">8sI4sII")
@@ -46,10 +47,10 @@ class _Intrinsics(Document):
     cx: Number | None = None
     cy: Number | None = None
     camera_model: _PinholeModel | None = Field(
-        None, description=f"one of {', '.join(get_args(_PinholeModel))}"
+        None, description=f"one of {', '.join(get_args(_PinholeModel))} ({_UNDISTORT})"
     )
     is_fisheye: Literal[False] | None = Field(
-        None, description="false, since rendering uses pinhole cameras"
+        None, description=f"false, since rendering uses pinhole cameras ({_UNDISTORT})"
     )
     k1: Number | None = None
     k2: Number | None = None
