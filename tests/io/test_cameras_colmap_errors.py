@@ -192,6 +192,16 @@ def test_damage_of_binary_models_is_one_sentence(case, tmp_path) -> None:
     assert camera_refusal(tmp_path) == f"{path}: {wanted}"
 
 
+@pytest.mark.parametrize("write", [colmap_txt, colmap_bin])
+def test_two_images_of_one_name_are_refused(write, tmp_path) -> None:
+    write(tmp_path, rows=[0, 1, 2], names=["b.jpg", "a.jpg", "b.jpg"])
+    path = tmp_path / f"images.{write.__name__[-3:]}"
+    assert camera_refusal(tmp_path) == (
+        f"{path}: each image must have a name of its own, by which its photograph is found, "
+        "found 'b.jpg' twice; remove one of them."
+    )
+
+
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "cameras.txt", "images.txt"])
 def test_random_damage_gives_cameras_or_a_format_error(name, tmp_path) -> None:

@@ -7,6 +7,7 @@ import os
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -69,6 +70,12 @@ def colmap_views(folder: Path, *, as_text: bool = False) -> list[View]:
         path = folder / "images.txt"
         lenses, images = _cameras_of_txt(folder / "cameras.txt"), _images_of_txt(path)
     images.sort(key=lambda image: image.name)
+    for before, image in pairwise(images):
+        if image.name == before.name:
+            raise FileFormatError(
+                f"{path}: each image must have a name of its own, by which its photograph is "
+                f"found, found {shown(image.name)} twice; remove one of them."
+            )
     for image in images:
         if image.camera not in lenses:
             raise FileFormatError(
