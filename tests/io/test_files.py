@@ -171,7 +171,16 @@ def test_point_cloud_ply_in_a_folder_is_read(tmp_path: Path) -> None:
 
 def test_the_size_of_an_unbundled_sog_includes_its_images(tmp_path: Path) -> None:
     shutil.unpack_archive(DATA / "splat-transform.sog", tmp_path, "zip")
-    assert scene_size(tmp_path) == sum(file.stat().st_size for file in tmp_path.iterdir())
+    size = sum(file.stat().st_size for file in tmp_path.iterdir())
+    assert scene_size(tmp_path) == size
+    (tmp_path / "preview.webp").write_bytes(bytes(1000))  # which meta.json does not name
+    assert scene_size(tmp_path) == scene_size(tmp_path / "meta.json") == size
+
+
+@pytest.mark.parametrize("text", ["[]", "{", '{"means": {"files": 3}}', '{"sh0": {"files": [3]}}'])
+def test_the_size_of_a_damaged_sog_is_that_of_its_file(tmp_path: Path, text: str) -> None:
+    (tmp_path / "meta.json").write_text(text)
+    assert scene_size(tmp_path) == len(text)
 
 
 def test_commands_accept_a_model_folder_and_its_cameras(

@@ -29,6 +29,7 @@ _GSPLAT_STEP = re.compile(r"ckpt_(\d+)_rank0\.pt")
 FREE_BYTES = 1 << 26  # a scene of at most this many bytes in memory may come from any file
 MOST_EXPANSION = 64  # else, it may take this many times the bytes of its file; real ones take 4-13
 MOST_JSON_BYTES = 1 << 26  # a larger .gltf has its buffers inside
+_STREAMED = ("**/*.webp", "**/*.png", "**/*.sog", "**/meta.json")  # files of a lod-meta.json
 LONGEST_NAME = 255  # characters that file systems allow in a name
 _FLOATS = 11  # numbers of a Gaussian without SH coefficients
 _MOST_WHOLE = 1 << 53  # whole numbers up to here are the same in every JSON parser
@@ -116,8 +117,8 @@ def scene_size(path: str | os.PathLike[str]) -> int:
         path: A file, or a folder that :func:`scene_file` finds a scene in.
 
     Returns:
-        Bytes of its file; for an unbundled or a streamed SOG, or a ``.gltf``, also those of its
-        other files.
+        Bytes of its file; for an unbundled SOG or a ``.gltf``, also those of the files that it
+        names, and for a streamed SOG those of all SOGs and images in its folder.
 
     Raises:
         InputError: There is no such file, or the folder holds no scene or cannot be read.
@@ -137,17 +138,25 @@ def scene_size(path: str | os.PathLike[str]) -> int:
 
 
 def _parts_of(file: Path) -> list[Path]:
-    """Return the other files of a scene of several files."""
-    images = ("*.webp", "*.png")
-    streamed = ("**/*.webp", "**/*.png", "**/*.sog", "**/meta.json")
-    patterns = {"meta.json": images, "lod-meta.json": streamed}.get(file.name, ())
-    if file.suffix.lower() == ".gltf" and is_file(file) and file.stat().st_size < MOST_JSON_BYTES:
-        with suppress(FileFormatError, AttributeError, KeyError, TypeError):  # a damaged file
-            buffers = parse_json(file.read_bytes(), file).get("buffers", [])
+    """Return the other files of a scene of several files, each once."""
+    if file.name == "lod-meta.json":
+        return [part for pattern in _STREAMED for part in file.parent.glob(pattern)]
+    is_gltf = file.suffix.lower() == ".gltf"
+    if not (is_gltf or file.name == "meta.json") or not is_file(file):
+        return []
+    if file.stat().st_size >= MOST_JSON_BYTES:
+        return []
+    with suppress(FileFormatError, AttributeError, KeyError, TypeError):  # a damaged file
+        document = parse_json(file.read_bytes(), file)
+        if is_gltf:
+            buffers = document.get("buffers", [])
             names = [unquote(buffer["uri"]) for buffer in buffers if "uri" in buffer]
-            places = {file.parent / name for name in names if is_within(name)}  # each once
-            return [place for place in places if is_file(place)]
-    return [part for pattern in patterns for part in file.parent.glob(pattern)]
+        else:
+            parts = [part for part in document.values() if isinstance(part, dict)]
+            names = [name for part in parts for name in part.get("files", ())]
+        places = {file.parent / name for name in names if is_within(name)}
+        return [place for place in places if is_file(place)]
+    return []
 
 
 def _scenes(folder: Path) -> Iterator[Path]:
