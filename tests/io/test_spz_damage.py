@@ -14,6 +14,7 @@ from cvtgs import load
 from cvtgs.errors import DroppedDataWarning, FileFormatError
 from format_cases import DATA, refusal, with_extension
 from format_oracles import read_spz
+from scenes import same_bits
 
 GOOD = gzip.decompress((DATA / "niantic-v3.spz").read_bytes())
 FOURTH = (DATA / "niantic-v4.spz").read_bytes()
@@ -101,6 +102,33 @@ def test_the_undamaged_file_is_read(tmp_path: Path) -> None:
     assert len(load(path)) == len(read_spz(path.read_bytes())) == 40
 
 
+@pytest.mark.parametrize("ends", [[5, 16], [16, 100, 2616], [100, 100, 101], [2616]])
+@pytest.mark.parametrize("padding", [b"", bytes(600)])
+def test_gzip_files_of_several_members_are_read(
+    tmp_path: Path, ends: list[int], padding: bytes
+) -> None:
+    path, whole = tmp_path / "a.spz", tmp_path / "whole.spz"
+    whole.write_bytes(gzip.compress(GOOD))
+    pieces = [GOOD[low:high] for low, high in zip([0, *ends], [*ends, None], strict=True)]
+    path.write_bytes(b"".join(map(gzip.compress, pieces)) + padding)
+    assert same_bits(load(path), load(whole))
+
+
+@pytest.mark.parametrize(
+    ("second", "text"),
+    [
+        (gzip.compress(GOOD[50:])[:-4], "must be intact gzip data, found it cut short."),
+        (gzip.compress(GOOD[50:])[:-8] + bytes(8), "must be intact gzip data, found damage: "),
+        (bytes(600) + gzip.compress(GOOD[50:]), f"{WANTED}, found 34."),
+    ],
+)
+def test_damage_of_a_further_member_is_noticed(tmp_path: Path, second: bytes, text: str) -> None:
+    path = tmp_path / "a.spz"
+    path.write_bytes(gzip.compress(GOOD[:50]) + second)
+    with pytest.raises(FileFormatError, match=text):
+        load(path)
+
+
 @pytest.mark.parametrize("count", [2**20, 2**32 - 1])
 def test_a_false_count_takes_no_memory(tmp_path: Path, count: int) -> None:
     path = tmp_path / "a.spz"
@@ -114,10 +142,14 @@ def test_a_false_count_takes_no_memory(tmp_path: Path, count: int) -> None:
     assert peak < 4 << 20
 
 
-def test_surplus_data_is_not_unpacked(tmp_path: Path) -> None:
+@pytest.mark.parametrize("members", [1, 2])
+def test_surplus_data_is_not_unpacked(tmp_path: Path, members: int) -> None:
     """The file holds 256 MiB of zeros after 40 Gaussians."""
     squeeze = zlib.compressobj(9, wbits=31)
     content = squeeze.compress(GOOD)
+    if members > 1:
+        content += squeeze.flush()
+        squeeze = zlib.compressobj(9, wbits=31)
     content += b"".join(squeeze.compress(bytes(1 << 24)) for _ in range(16)) + squeeze.flush()
     path = tmp_path / "a.spz"
     path.write_bytes(content)

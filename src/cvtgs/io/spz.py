@@ -43,8 +43,8 @@ _TABLE_ENTRY = struct.Struct("<QQ")  # compressed and uncompressed size of a blo
 _COLOR_SCALE = np.float32(0.15)  # bytes hold ``0.5 + 0.15 sh0``, wider than displayable colours
 _STORED_REST_COUNTS = (*REST_COUNTS, 24)  # a scene leaves out the coefficients of degree 4
 _GZIP_BITS = zlib.MAX_WBITS | 16  # zlib's code for gzip, without name and time
-_USUAL_BITS = 12  # as in Niantic's library
-_MOST_BITS, _MOST_READ_BITS = 22, 24
+_PIECE_BYTES = 1 << 14  # to unpack at once: small, since what follows a member is copied
+_USUAL_BITS, _MOST_BITS, _MOST_READ_BITS = 12, 22, 24  # the first as in Niantic's library
 _OUTLIERS = 0.001  # share of the Gaussians that may be clamped
 _CHUNK_ROWS = 1 << 18
 _ZSTD_LEVEL = 12  # size and time are those of gzip; 19 is 4 % smaller and takes ten times as long
@@ -139,12 +139,8 @@ def decode_spz(
 
 def peek_spz(content: bytes, path: Path | str) -> SpzHeader:
     """Return the header of the bytes of an ``.spz`` file, without unpacking its Gaussians."""
-    start, is_packed = content[: _HEADER.size], content.startswith(_GZIP)
-    if is_packed:
-        try:
-            start = zlib.decompressobj(_GZIP_BITS).decompress(content, _HEADER.size)
-        except zlib.error as error:
-            raise _damage(path, error) from error
+    is_packed, size = content.startswith(_GZIP), _HEADER.size
+    start = bytes(_gunzip(content, size, path)[0] if is_packed else content[:size])
     if len(start) < _HEADER.size or not start.startswith(_MAGIC):
         raise FileFormatError(
             f"{path}: an .spz file must start with a header of {_HEADER.size} bytes that begin "
@@ -186,23 +182,18 @@ def _quats_of(stored: UInt8[np.ndarray, "n b"]) -> Float[np.ndarray, "n 4"]:
 
 def _read_gzip(content: bytes, header: SpzHeader, path: Path | str) -> tuple[Blocks, bytes]:
     """Return the blocks of version 1 to 3, and the extensions after them."""
-    stream, wanted = zlib.decompressobj(_GZIP_BITS), sum(header.sizes.values())
-    is_extended = bool(header.flags & _EXTENDED)
-    try:
-        stream.decompress(content, _HEADER.size)
-        payload = stream.decompress(stream.unconsumed_tail, wanted)
-        surplus = stream.decompress(
-            stream.unconsumed_tail, _MOST_EXTENSION_BYTES if is_extended else 1
-        )
-    except zlib.error as error:
-        raise _damage(path, error) from error
-    if len(payload) < wanted:
+    end, is_extended = _HEADER.size + sum(header.sizes.values()), bool(header.flags & _EXTENDED)
+    spare = _MOST_EXTENSION_BYTES if is_extended else 0
+    data, is_intact = _gunzip(content, end + spare + 1, path)
+    surplus = bytes(data[end:])
+    if len(data) < end:
         raise FileFormatError(
-            f"{path}: must hold {wanted:,} bytes for the {header.count:,} Gaussians of SH degree "
-            f"{header.sh_degree} that the header promises, found {len(payload):,}."
+            f"{path}: must hold {end - _HEADER.size:,} bytes for the {header.count:,} Gaussians of "
+            f"SH degree {header.sh_degree} that the header promises, found "
+            f"{len(data) - _HEADER.size:,}."
         )
     is_whole = sum(8 + size for _, size, _ in _records(surplus)) == len(surplus)
-    if is_extended and (stream.unconsumed_tail or not is_whole):
+    if is_extended and (len(surplus) > spare or not is_whole):
         raise FileFormatError(  # a draft had them before the Gaussians, which are then others
             f"{path}: the extensions after the Gaussians must be whole records of at most "
             f"{_MOST_EXTENSION_BYTES:,} bytes together, found others; write it as version 4."
@@ -210,11 +201,29 @@ def _read_gzip(content: bytes, header: SpzHeader, path: Path | str) -> tuple[Blo
     if surplus and not is_extended:
         text = f"{path}: left out the bytes after the {header.count:,} Gaussians of the header."
         warn(text, DroppedDataWarning)
-    elif not stream.eof:
+    elif not is_intact:
         raise FileFormatError(f"{path}: must be intact gzip data, found it cut short.")
-    ends = np.cumsum(list(header.sizes.values()), dtype=np.int64)[:-1]
-    blocks = np.split(np.frombuffer(payload, np.uint8), ends)
+    ends = np.cumsum([_HEADER.size, *header.sizes.values()], dtype=np.int64)
+    _, *blocks, _ = np.split(np.frombuffer(data, np.uint8), ends)
     return dict(zip(header.sizes, blocks, strict=True)), surplus if is_extended else b""
+
+
+def _gunzip(content: bytes, most: int, path: Path | str) -> tuple[bytearray, bool]:
+    """Unpack at most so many bytes of all gzip members, and say whether the last one ended."""
+    data, stream, at = bytearray(), zlib.decompressobj(_GZIP_BITS), 0
+    while len(data) < most and at < len(content):
+        if stream.eof:
+            if not content.startswith(_GZIP, at):  # padding
+                break
+            stream = zlib.decompressobj(_GZIP_BITS)
+        piece = content[at : at + _PIECE_BYTES]
+        try:
+            data += stream.decompress(piece, most - len(data))
+        except zlib.error as error:
+            text = f"{path}: must be intact gzip data, found damage: {error}."
+            raise FileFormatError(text) from error
+        at += len(piece) - len(stream.unconsumed_tail) - len(stream.unused_data)
+    return data, stream.eof
 
 
 def _read_version_4(content: bytes, header: SpzHeader, path: Path | str) -> tuple[Blocks, bytes]:
@@ -239,10 +248,6 @@ def _read_version_4(content: bytes, header: SpzHeader, path: Path | str) -> tupl
         blocks[name] = _unzstd(content[at : at + packed], size, f"{path}: block {name!r}")
         at += packed
     return blocks, content[_FOURTH_HEADER_BYTES:start] if header.flags & _EXTENDED else b""
-
-
-def _damage(path: Path | str, error: zlib.error) -> FileFormatError:
-    return FileFormatError(f"{path}: must be intact gzip data, found damage: {error}.")
 
 
 def _records(extensions: bytes) -> Iterator[tuple[int, int, bytes]]:
