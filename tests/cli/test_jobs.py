@@ -226,6 +226,7 @@ def test_invalid_combinations_of_paths_are_usage_errors(
         (NAMES, "any number of IN and -o DIR to write into a folder; found 3 paths (a.ply, "),
         (["a.ply", "folder"], "OUT must be a file; to write into a folder, use -o folder\n"),
         (["a.ply", "new/"], "OUT must be a file; to write into a folder, use -o new/\n"),
+        (["a.ply", "new"], "such as new.ply; to write into a folder, use -o new\n"),
     ],
 )
 def test_a_forgotten_o_is_mentioned(

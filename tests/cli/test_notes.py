@@ -203,6 +203,16 @@ def test_a_value_with_a_minus_gets_a_hint_or_is_taken(capsys, source):
     assert "with a minus sign, write --translate=-1,0,0" in printed(capsys, *words, status=2)
 
 
+@pytest.mark.parametrize(
+    ("value", "hint"),
+    [("-small.ply", "; with a minus sign, write --suffix=-small.ply"), ("-o", "")],
+)
+def test_a_suffix_with_a_minus_gets_a_hint(capsys, source, value, hint):
+    words = ["convert", source, "-o", source.parent / "out", "--suffix", value]
+    text = printed(capsys, *words, status=2)
+    assert text.endswith(f"argument --suffix: expected one argument{hint}")
+
+
 def test_columns_that_a_merge_leaves_out_are_listed_as_lost(capsys, source):
     scene = cvtgs.load(source)
     more = scene.with_tensors({}, {"heat": torch.zeros(300), "id": torch.zeros(300)})

@@ -184,7 +184,7 @@ def test_tensors_of_any_memory_layout_are_written(tmp_path: Path, end: str) -> N
 @pytest.mark.parametrize(
     ("content", "error", "text"),
     [
-        (b"", FileFormatError, "the first bytes must be those of a .ply, .spz, .sog, .glb or .pt"),
+        (b"", FileFormatError, "a .ply, .spz, .sog, .glb or .pt, found no bytes at all; give"),
         (b"what?", FileFormatError, "found b'what'; give format= for other formats"),
         (b"ply\nnonsense", FileFormatError, "the BytesIO: the header must end with 'end_header'"),
         (b"PK\x03\x04nonsense", FileFormatError, "the BytesIO: a .sog must be a zip"),

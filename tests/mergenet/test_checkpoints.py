@@ -288,7 +288,8 @@ def test_an_impossible_file_name_is_refused():
 
 
 def test_a_folder_and_a_path_through_a_file_are_refused(path):
-    assert refusal(path.parent) == "a checkpoint must be a file of at most 64 MiB."
+    text = "a checkpoint must be a file of at most 64 MiB, found a folder or a device."
+    assert refusal(path.parent) == text
     path.write_bytes(b"")
     assert refusal(path / "deeper") == "the checkpoint cannot be read: not a directory."
 
@@ -296,7 +297,7 @@ def test_a_folder_and_a_path_through_a_file_are_refused(path):
 def test_a_huge_file_is_not_read(path):
     with path.open("wb") as file:
         file.truncate(LARGEST_FILE + 1)
-    assert refusal(path) == "a checkpoint must be a file of at most 64 MiB."
+    assert refusal(path) == "a checkpoint must be a file of at most 64 MiB, found 67,108,865 bytes."
 
 
 def test_an_untrained_network_is_a_valid_checkpoint(path):

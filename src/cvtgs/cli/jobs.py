@@ -100,6 +100,11 @@ def check_paths(parser: CommandParser, options: argparse.Namespace) -> None:
     target = options.paths[1]
     if os.path.isdir(target) or target.endswith(("/", os.sep)):  # noqa: PTH112 (any path)
         parser.error(f"OUT must be a file; to write into a folder, use -o {target}")
+    if "." not in Path(target).name and target != STREAM:
+        parser.error(
+            f"OUT must end in the suffix of a format, such as {target}.ply; to write into a "
+            f"folder, use -o {target}"
+        )
     if options.suffix and target != STREAM:
         parser.error("--suffix needs -o DIR or - as OUT; otherwise the name of OUT sets the format")
 

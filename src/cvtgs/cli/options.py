@@ -244,7 +244,8 @@ class CommandParser(argparse.ArgumentParser):
         message = message.replace("invalid float value: ", "must be a number, found ")
         lacks = re.fullmatch(r"argument (?:.*/)?(--[\w-]+): expected one argument", message)
         for option, value in pairwise(self._words):
-            if lacks and option == lacks[1] and re.match(r"-[\d.]", value):
+            is_value = re.match(r"-[^-]", value) and value not in self._option_string_actions
+            if lacks and option == lacks[1] and is_value:
                 message += f"; with a minus sign, write {option}={value}"
         super().error(message)
 

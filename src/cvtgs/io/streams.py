@@ -55,9 +55,10 @@ def file_of(
     while len(start) < _MOST_FIRST_BYTES and (chunk := next(chunks, b"")):
         start += chunk
     if format is None and not start.startswith((b"PK", *_FIRST_BYTES)):
+        found = repr(start[:_MOST_FIRST_BYTES]) if start else "no bytes at all"
         raise FileFormatError(
             f"{name}: the first bytes must be those of a .ply, .spz, .sog, .glb or .pt, found "
-            f"{start[:_MOST_FIRST_BYTES]!r}; {advice}."
+            f"{found}; {advice}."
         )
     with ExitStack() as stack:
         try:

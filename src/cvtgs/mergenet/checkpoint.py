@@ -170,7 +170,7 @@ def _read(path: Path, name: str) -> bytes:
     try:
         if path.is_file() and path.stat().st_size <= LARGEST_FILE:
             return path.read_bytes()
-        path.stat()
+        size = path.stat().st_size
     except (FileNotFoundError, ValueError):
         hint = f" For the preset, write preset={name!r} (--preset {name})." * (name in PRESETS)
         raise CheckpointError(
@@ -178,7 +178,10 @@ def _read(path: Path, name: str) -> bytes:
         ) from None
     except OSError as error:
         raise CheckpointError(f"the checkpoint cannot be read: {reason_of(error)}.") from error
-    raise CheckpointError(f"a checkpoint must be a file of at most {LARGEST_FILE >> 20} MiB.")
+    found = f"{size:,} bytes" if path.is_file() else "a folder or a device"
+    raise CheckpointError(
+        f"a checkpoint must be a file of at most {LARGEST_FILE >> 20} MiB, found {found}."
+    )
 
 
 def _unpack(content: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
