@@ -213,6 +213,15 @@ def test_a_suffix_with_a_minus_gets_a_hint(capsys, source, value, hint):
     assert text.endswith(f"argument --suffix: expected one argument{hint}")
 
 
+@pytest.mark.parametrize(
+    ("option", "hint"),
+    [("--rho", "options come after the command"), ("--versoin", "did you mean --version?")],
+)
+def test_unknown_options_before_the_command_get_a_hint(capsys, source, option, hint):
+    text = printed(capsys, option, "0.1", "simplify", source, "out.ply", status=2)
+    assert text.endswith(f"cvtgs: error: unrecognized argument: {option}; {hint}")
+
+
 def test_columns_that_a_merge_leaves_out_are_listed_as_lost(capsys, source):
     scene = cvtgs.load(source)
     more = scene.with_tensors({}, {"heat": torch.zeros(300), "id": torch.zeros(300)})

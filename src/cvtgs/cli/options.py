@@ -204,16 +204,17 @@ class CommandParser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse the words; report an unknown option even if a required one is missing, too."""
         self._words = args or ()
-        if self._subparsers is None:  # the parser of one command
-            options = self._option_string_actions
-            for word in takewhile(lambda word: word != "--", args or ()):
-                name = word.partition("=")[0]
-                if name.startswith("--") and not any(one.startswith(name) for one in options):
-                    self.error(
-                        f"unrecognized argument: {name}{suggestion(name, options, likeness=0.7)}"
-                    )
-                if name.startswith("-") and f"-{name}" in options:  # else -output means -o utput
-                    self.error(f"unrecognized argument: {name}; did you mean -{name}?")
+        options, of_all = self._option_string_actions, self._subparsers is not None
+        for word in takewhile(lambda word: word != "--", self._words):
+            if of_all and not word.startswith("-"):  # the command
+                break
+            name = word.partition("=")[0]
+            if name.startswith("--") and not any(one.startswith(name) for one in options):
+                hint = suggestion(name, options, likeness=0.7)
+                hint = hint or "; options come after the command" * of_all
+                self.error(f"unrecognized argument: {name}{hint}")
+            if name.startswith("-") and f"-{name}" in options:  # else -output means -o utput
+                self.error(f"unrecognized argument: {name}; did you mean -{name}?")
         known, rest = super().parse_known_args(args, namespace)
         if self.check is not None:  # allows paths between options
             known.paths += [word for word in rest if word == "-" or not word.startswith("-")]
