@@ -1,6 +1,7 @@
 """PSNR, SSIM and alpha error against hand-computed values and scipy."""
 
 import math
+from collections.abc import Iterator
 from contextlib import nullcontext
 
 import numpy as np
@@ -20,8 +21,9 @@ from cvtgs.evaluation import (
     psnr,
     ssim,
 )
-from cvtgs.evaluation.blind_views import check_seen
+from cvtgs.evaluation.blind_views import check_seen, check_two_see
 from cvtgs.losses import ssim_loss
+from cvtgs.scene import GaussianScene
 from cvtgs.views import automatic_views
 from scenes import random_scene
 
@@ -229,6 +231,26 @@ def test_cameras_most_of_which_see_nothing_are_a_warning(blind: int) -> None:
     with expected if blind == 2 else nullcontext():
         check_seen(scene, cameras, name="it")
     check_seen(scene, cameras, name="it", is_sample=True)
+
+
+def test_all_parts_are_read_until_a_second_camera_sees_a_gaussian() -> None:
+    """The second camera looks away from the sample, at the second part."""
+    intrinsics = torch.tensor([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]]).expand(2, 3, 3)
+    poses = torch.stack([torch.eye(4), torch.diag(torch.tensor([-1.0, 1, -1, 1]))])
+    cameras = Cameras(viewmats=poses, Ks=intrinsics, width=16, height=16)
+    front = random_scene(9).with_tensors(means=torch.tensor([[0.0, 0, 9]]).repeat(9, 1))
+    back = front.with_tensors(means=-front.means)
+    read = []
+
+    def parts(*scenes: GaussianScene) -> Iterator[GaussianScene]:
+        for scene in scenes:
+            read.append(scene)
+            yield scene
+
+    check_two_see(front, parts(front, back, front), cameras, name="it")
+    assert read == [front, back]
+    with pytest.raises(InvalidArgumentError, match=r"2 cameras that see it, .* found 1 of 2"):
+        check_two_see(front, parts(front), cameras, name="it")
 
 
 def test_cameras_that_see_a_few_gaussians_of_many_are_not_blind() -> None:

@@ -83,6 +83,18 @@ def test_cameras_most_of_which_see_nothing_are_a_warning_as_in_one_piece(
         in_blocks(source, tmp_path / "out.ply", MATCHED, cameras=away)
 
 
+def test_a_refinement_by_one_camera_that_sees_is_refused_as_in_one_piece(scene, source, tmp_path):
+    turned = ring(4).viewmats.clone()
+    turned[1:] = torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ turned[1:]
+    away, text = replace(ring(4), viewmats=turned), "2 cameras that see the scene, .* found 1 of 4"
+    simplifier = Simplifier(config=SimplifyConfig.from_mapping(REFINED), device="cpu")
+    with pytest.raises(InvalidArgumentError, match=text):
+        simplifier.run(scene, count=150, cameras=away)
+    with pytest.raises(InvalidArgumentError, match=text):
+        in_blocks(source, tmp_path / "out.ply", REFINED, cameras=away)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_cameras_see_protected_rows_too(two_objects, tmp_path):
     """Eight of ten look at the second object only, which a box protects."""
     turned = ring(10).viewmats.clone()

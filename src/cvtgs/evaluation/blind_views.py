@@ -1,6 +1,6 @@
 """Find views that show nothing of a scene, in which every result would look perfect."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from jaxtyping import Float
 from torch import Tensor
@@ -50,12 +50,37 @@ def check_seen(
             f"views; give cameras of this scene, in its axes and units."
         )
     if refines and empty == len(cameras) - 1 and not is_sample:
-        raise InvalidArgumentError(
-            f"a refinement needs at least 2 cameras that see {name}, one of them to be held out; "
-            f"found 1 of {len(cameras)}."
-        )
+        raise _seen_by_one(len(cameras), name)
     if not is_sample:
         _warn_of_blind(empty, len(cameras), name)
+
+
+def check_two_see(
+    sample: GaussianScene, parts: Iterable[GaussianScene], cameras: Cameras, *, name: str
+) -> None:
+    """Raise if fewer than two cameras see anything of a scene; in doubt, its parts are read."""
+    blind = _missing(_drawn(sample), cameras.singles())
+    if len(cameras) - len(blind) < 2:
+        blind = [camera for camera in blind if _is_empty(sample, camera)]
+    rest = iter(parts)
+    while len(cameras) - len(blind) < 2:
+        part = next(rest, None)
+        if part is None:
+            raise _seen_by_one(len(cameras), name)
+        blind = _missing(_drawn(part), blind)
+
+
+def _missing(points: Float[Tensor, "n 3"], cameras: Sequence[Cameras]) -> list[Cameras]:
+    """Return the cameras with none of the points in their images."""
+    exact = points.double()
+    return [camera for camera in cameras if not camera.shows_any(exact)]
+
+
+def _seen_by_one(count: int, name: str) -> InvalidArgumentError:
+    return InvalidArgumentError(
+        f"a refinement needs at least 2 cameras that see {name}, one of them to be held out; "
+        f"found 1 of {count}."
+    )
 
 
 def warn_of_blind(scene: GaussianScene, cameras: Cameras, *, name: str) -> None:
@@ -79,14 +104,17 @@ def _count_blind(
     points = _drawn(scene)
     blind = cameras.to("cpu").singles()
     for some in (points[:: -(-len(points) // SAMPLED)].cpu(), points):  # all only in doubt
-        exact = some.double()
-        blind = [camera for camera in blind if not camera.shows_any(exact)]
+        blind = _missing(some, blind)
         seeing = len(cameras) - len(blind)
         if seeing >= max(len(blind), enough):
             return 0
-    images = (render_views(scene, camera.fitted(PREVIEW), backend=backend) for camera in blind)
-    # Gaussians beside an image may reach into it
-    return sum(float(image.alpha.mean()) < LEAST_COVER for image in images)
+    return sum(_is_empty(scene, camera, backend=backend) for camera in blind)
+
+
+def _is_empty(scene: GaussianScene, camera: Cameras, *, backend: BackendName = "auto") -> bool:
+    """Return whether an image shows nothing; Gaussians beside it may reach into it."""
+    image = render_views(scene, camera.fitted(PREVIEW), backend=backend)
+    return float(image.alpha.mean()) < LEAST_COVER
 
 
 def shows(scene: GaussianScene, camera: Cameras, alpha: Float[Tensor, "1 h w"]) -> bool:

@@ -16,7 +16,7 @@ from cvtgs.counts import checked_whole, shared_out, shortfall, target_count, who
 from cvtgs.devices import HOST, full_precision, on_host, one_thread
 from cvtgs.edit import concatenate
 from cvtgs.errors import ConfigError, check_path, warn
-from cvtgs.evaluation.blind_views import check_seen
+from cvtgs.evaluation.blind_views import check_seen, check_two_see
 from cvtgs.grouping import most_cells
 from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES, checked_axes
@@ -38,7 +38,7 @@ from cvtgs.outofcore.memory import (
 )
 from cvtgs.outofcore.merge import read_report
 from cvtgs.outofcore.rows import kept_rows
-from cvtgs.outofcore.scan import CHUNK, read_sample
+from cvtgs.outofcore.scan import CHUNK, read_chunks, read_sample
 from cvtgs.outofcore.sort import sort_into_blocks
 from cvtgs.outofcore.steps import run_steps
 from cvtgs.prepared import check_cameras
@@ -113,7 +113,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
 
     Raises:
         ConfigError: The configuration cannot be used with blocks.
-        InvalidArgumentError: Ratio, count or boxes cannot be met, or a number is out of range.
+        InvalidArgumentError: Ratio, count or boxes cannot be met, a number is out of range, no
+            given camera sees the scene, or only one does for a refinement.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
         OutputExistsError: The output exists and may not be replaced.
@@ -148,7 +149,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         warn_of_writing(output, rows, target=target, memory=room, workers=workers)
     if simplifier.config.uses_images:
         room -= IMAGE_BYTES
-        cameras = _cameras_to_fit(cameras, rows, source, axes=source_axes)
+        refines = simplifier.config.refine.enabled
+        cameras = _cameras_to_fit(cameras, rows, source, axes=source_axes, refines=refines)
     allocation = simplifier.config.allocation
     merging = merging_rows(target, rows.count, allocation)
     job = Job(
@@ -192,7 +194,12 @@ def simplify_file(  # noqa: PLR0913 (options by name)
 
 
 def _cameras_to_fit(
-    given: Cameras | None, rows: PlyRows, source: str | os.PathLike[str], *, axes: str | None
+    given: Cameras | None,
+    rows: PlyRows,
+    source: str | os.PathLike[str],
+    *,
+    axes: str | None,
+    refines: bool,
 ) -> Cameras | None:
     """Return the given cameras, which must show the scene, or those beside the source."""
     if given is None and axes not in (None, SCENE_AXES):
@@ -200,6 +207,8 @@ def _cameras_to_fit(
     sample = read_sample(rows, SAMPLED)
     if given is not None:
         check_seen(sample, given, name="the scene", is_sample=True)
+        if refines:
+            check_two_see(sample, read_chunks(rows), given, name="the scene")
         return given
     own = find_own_cameras(sample, source)
     if own is None:

@@ -3,7 +3,7 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import reduce
 from operator import add
@@ -160,6 +160,13 @@ def read_sample(source: PlyRows, count: int) -> GaussianScene:
         for start in range(0, source.count, rows)
     )
     return validity.valid_part(source.assemble(parts, -(-source.count // step)))
+
+
+def read_chunks(source: PlyRows) -> Iterator[GaussianScene]:
+    """Read the valid Gaussians chunk by chunk."""
+    for start in range(0, source.count, CHUNK):
+        rows = source.read(start, min(start + CHUNK, source.count))
+        yield validity.valid_part(source.scene(rows))
 
 
 def _one_of(rows: NDArray[Any], step: int) -> NDArray[Any]:
