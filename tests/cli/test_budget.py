@@ -15,8 +15,16 @@ import cvtgs
 from cvtgs.budget import CostModel, Found
 from cvtgs.budget.calibrate import CANDIDATES
 from cvtgs.budget.costs import FEATURES
+from cvtgs.cli.cameras import own_cameras, read_cameras
 from cvtgs.cli.display import target_note
-from cvtgs.cli.goals import STARTED, check_goals, choose_preset, search_target
+from cvtgs.cli.goals import (
+    STARTED,
+    SearchViews,
+    check_goals,
+    choose_preset,
+    search_target,
+    views_of_search,
+)
 from cvtgs.cli.main import build_parser, main
 from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.progress import silent
@@ -237,44 +245,57 @@ def test_a_target_is_measured_over_the_views_of_evaluate(source, capsys):
 
 
 @pytest.mark.parametrize(
-    ("preset", "beside", "given", "scored", "views"),
+    ("words", "beside", "given", "views"),
     [
-        ("draft", 0, 0, 0, "automatic views"),
-        ("draft", 12, 0, 8, "8 cameras found in {}"),
-        ("draft", 12, 3, 3, "the given cameras"),
-        ("high", 12, 0, 0, "automatic views that it was not fitted to"),
-        ("high", 0, 3, 0, "automatic views that it was not fitted to"),
+        (["draft"], 0, 0, (0, None, "automatic views")),
+        (["draft"], 12, 0, (12, 8, "8 cameras found in {beside}")),
+        (["draft"], 12, 3, (3, 3, "the given cameras")),
+        (["high"], 0, 0, (0, None, "automatic views that")),
+        (["high"], 12, 0, (12, None, "automatic views that")),
+        (["high"], 32, 0, (28, 4, "4 test cameras of {beside}, which")),
+        (["high"], 80, 0, (70, 8, "8 test cameras of {beside}, which")),
+        (["high"], 0, 3, (3, None, "automatic views that")),
+        (["high"], 80, 90, (78, 12, "12 test cameras of {given}, which")),
+        (["high", "--split", "train"], 0, 90, (78, 12, "12 test cameras of {given}, which")),
+        (["high", "--split", "test"], 0, 90, (12, None, "automatic views that")),
     ],
 )
-def test_a_target_is_measured_over_the_views_of_evaluate_which_are_named(  # noqa: PLR0917
-    source, scene, monkeypatch, preset, beside, given, scored, views
-):
-    """Presets that use images are fitted to these."""
-    heldout: list[cvtgs.Cameras | None] = []
+def test_a_target_is_measured_over_views_that_no_preset_was_fitted_to(
+    source: Path, scene: cvtgs.GaussianScene, words: list[str], beside: int, given: int, views: Any
+) -> None:
+    """These are automatic views unless cameras have a test split of at least four."""
+    folders = {"beside": source.parent, "given": source.parent / "given"}
+    asked = options("--target-psnr", "30", "--preset", *words)
+    asked.input = source
+    asked.cameras = write_cameras(folders["given"], given) if given else None
+    write_cameras(folders["beside"], beside)
+    cameras = read_cameras(asked)
+    own = own_cameras(asked, scene, source) if cameras is None else None
+    cameras = cameras if own is None else own.cameras
+    found = views_of_search(asked, cvtgs.SimplifyConfig(preset=asked.preset), cameras, own)
+    fitted, heldout, name = views
+    assert len(found.cameras or ()) == fitted
+    assert (found.heldout and len(found.heldout)) == heldout
+    name = name.format(**{key: folder.resolve() for key, folder in folders.items()})
+    assert found.name == name + " it was not fitted to" * name.endswith(("that", "which"))
+    if found.heldout is not None and not given:
+        assert (found.heldout.width, found.heldout.height) == (640, 480)
+    if asked.preset == "high" and found.heldout is not None:
+        assert not set(found.heldout.names) & set(found.cameras.names)
 
-    def find_count(*_, **settings):
-        heldout.append(settings["heldout"])
-        return Found(scene, None, 30.0, 0.9, 0.1, -0.1, tried=())
 
-    monkeypatch.setattr(cvtgs.budget, "find_count", find_count)
-    path = source.with_name("transforms.json")
-    if beside:
-        poses = [
-            [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4 + row / 4], [0, 0, 0, 1]]
-            for row in range(beside)
-        ]
-        frames = [{"file_path": f"{r}.png", "transform_matrix": p} for r, p in enumerate(poses)]
-        path.write_text(json.dumps({"w": 48, "h": 36, "fl_x": 40.0, "frames": frames}))
-    cameras = cvtgs.views.automatic_views(scene, given) if given else None
-    asked = options("--target-psnr", "30")
-    asked.input, asked.output = source, Path("a.ply")
-    settings = {"cameras": cameras, "axes": None, "listener": silent}
-    _, note = search_target(asked, scene, cvtgs.Simplifier(preset=preset), **settings)
-    assert f" over {views.format(path.resolve().parent)}; found" in note
-    (found,) = heldout
-    assert len(found or ()) == scored
-    if scored == 8:
-        assert (found.width, found.height) == (640, 480)
+def write_cameras(folder: Path, count: int) -> Path:
+    """Write some cameras that look at the scene, if there are any; return their folder."""
+    poses = [
+        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4 + row / count], [0, 0, 0, 1]]
+        for row in range(count)
+    ]
+    frames = [{"file_path": f"{r:03d}.png", "transform_matrix": p} for r, p in enumerate(poses)]
+    folder.mkdir(exist_ok=True)
+    if count:
+        document = {"w": 48, "h": 36, "fl_x": 40.0, "frames": frames}
+        (folder / "transforms.json").write_text(json.dumps(document))
+    return folder
 
 
 def test_a_psnr_at_its_limit_is_at_least_that(scene):
@@ -341,15 +362,8 @@ def test_a_preset_fits_into_what_start_and_reading_left(scene: cvtgs.GaussianSce
 
 
 @pytest.mark.parametrize(("name", "is_read_back"), [("a.ply", False), ("a.splat", True)])
-@pytest.mark.parametrize(("preset", "views"), [("draft", "the given ones"), ("matched", None)])
-def test_a_target_is_measured_on_the_file_and_over_views_that_nothing_was_fitted_to(
-    scene: cvtgs.GaussianScene,
-    monkeypatch: pytest.MonkeyPatch,
-    *,
-    name: str,
-    is_read_back: bool,
-    preset: str,
-    views: str | None,
+def test_a_target_is_measured_on_the_file_over_the_heldout_views(
+    scene: cvtgs.GaussianScene, monkeypatch: pytest.MonkeyPatch, *, name: str, is_read_back: bool
 ) -> None:
     given: dict[str, Any] = {}
 
@@ -358,11 +372,12 @@ def test_a_target_is_measured_on_the_file_and_over_views_that_nothing_was_fitted
         return Found(scene, cast("Any", None), 30.0, 0.9, 0.1, -0.1, tried=())
 
     monkeypatch.setattr("cvtgs.budget.find_count", find_count)
-    known, cameras = options("--target-psnr", "20"), cast("Any", "the given ones")
+    known, views = options("--target-psnr", "20"), SearchViews("fitted", "scored", "ten of them")
     known.output = Path(name)
-    simplifier = cvtgs.Simplifier(preset=preset, device="cpu")
-    search_target(known, scene, simplifier, cameras=cameras, axes=None, listener=silent)
-    assert (given["cameras"], given["heldout"]) == (cameras, views)
+    simplifier = cvtgs.Simplifier(preset="matched", device="cpu")
+    _, note = search_target(known, scene, simplifier, views=views, axes=None, listener=silent)
+    assert (given["cameras"], given["heldout"]) == ("fitted", "scored")
+    assert " over ten of them; found" in note
     assert (given["written"](scene) is not scene) == is_read_back
 
 

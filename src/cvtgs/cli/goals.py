@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import cvtgs
-from cvtgs.cli.cameras import AUTOMATIC_VIEWS, SCORED_SIZE, own_cameras
+from cvtgs.cli.cameras import AUTOMATIC_VIEWS, SCORED_SIZE
 from cvtgs.cli.display import say, target_note
 from cvtgs.errors import (
     CvtgsError,
@@ -143,27 +143,53 @@ def _seconds_to_write(
     return fixed + max(0.0, min(whole) - fixed) * count / len(some)
 
 
+class SearchViews(NamedTuple):
+    """Cameras to fit presets to and to score over, None for automatic views; and their name."""
+
+    cameras: "cvtgs.Cameras | None"
+    heldout: "cvtgs.Cameras | None"
+    name: str
+
+
+def views_of_search(
+    options: argparse.Namespace,
+    config: "cvtgs.SimplifyConfig",
+    cameras: "cvtgs.Cameras | None",
+    own: "cvtgs.views.OwnCameras | None",
+) -> SearchViews:
+    """Choose the views of a search; presets that use images are fitted to others than score."""
+    if not config.uses_images:
+        if own is None:
+            name = "automatic views" if cameras is None else "the given cameras"
+            return SearchViews(cameras, cameras, name)
+        scored = own.cameras.spread(AUTOMATIC_VIEWS).fitted(SCORED_SIZE)
+        name = f"{counted(len(scored), 'camera')} found in {own.source.resolve()}"
+        return SearchViews(cameras, scored, name)
+    known = own
+    if cameras is not None and own is None and options.split != "test":
+        known = cvtgs.views.OwnCameras(cameras, options.cameras)
+    with without_warnings(DroppedDataWarning):  # reading all cameras has warned
+        test = None if known is None else known.test_cameras()
+        if known is None or test is None:
+            return SearchViews(cameras, None, "automatic views that it was not fitted to")
+        training = cvtgs.load_cameras(known.source, split="train")
+    if own is not None:
+        test = test.spread(AUTOMATIC_VIEWS).fitted(SCORED_SIZE)
+    name = f"{counted(len(test), 'test camera')} of {known.source.resolve()}"
+    return SearchViews(training, test, f"{name}, which it was not fitted to")
+
+
 def search_target(
     options: argparse.Namespace,
     scene: "cvtgs.GaussianScene",
     simplifier: "cvtgs.Simplifier",
     *,
-    cameras: "cvtgs.Cameras | None",
+    views: SearchViews,
     axes: str | None,
     listener: "cvtgs.ProgressListener",
 ) -> tuple["cvtgs.budget.Found", str]:
     """Search for the smallest scene whose file reaches the quality; return it, and a sentence."""
     is_rounded = rounds(options.output)
-    heldout, views = cameras, "the given cameras"
-    if simplifier.config.uses_images:
-        heldout, views = None, "automatic views that it was not fitted to"
-    elif cameras is None:
-        own = own_cameras(options, scene, options.input)
-        if own is None:
-            views = "automatic views"
-        else:
-            heldout = own.cameras.spread(AUTOMATIC_VIEWS).fitted(SCORED_SIZE)
-            views = f"{counted(len(heldout), 'camera')} found in {own.source.resolve()}"
 
     def read_back(small: "cvtgs.GaussianScene") -> "cvtgs.GaussianScene":
         """Write a scene to a temporary file of the format of OUT, and read it again."""
@@ -179,8 +205,8 @@ def search_target(
             psnr=options.target_psnr,
             ssim=options.target_ssim,
             simplifier=simplifier,
-            cameras=cameras,
-            heldout=heldout,
+            cameras=views.cameras,
+            heldout=views.heldout,
             written=read_back if is_rounded else lambda small: small,
             listener=listener,
         )
@@ -191,7 +217,7 @@ def search_target(
             f"{error} These are scores of files of this format, which rounds; a plain .ply does "
             f"not."
         ) from error
-    return found, target_note(found, views)
+    return found, target_note(found, views.name)
 
 
 def rounds(path: Path) -> bool:

@@ -24,6 +24,7 @@ from cvtgs.cli.goals import (
     choose_preset,
     has_target,
     search_target,
+    views_of_search,
     with_limited_bands,
 )
 from cvtgs.cli.jobs import Outcome, add_paths, make_output_folder, open_jobs, run_jobs
@@ -79,8 +80,10 @@ def add_simplify(add_parser: AddParser) -> None:
         type=float,
         metavar="DB",
         help="PSNR (at most 60) that OUT is to reach with as few Gaussians as possible, over "
-        "--cameras or the automatic views of cvtgs evaluate; for presets that use images, over "
-        "other automatic views; every try is written and read, which takes long for .sog",
+        "--cameras, those beside IN or the automatic views of cvtgs evaluate; presets that use "
+        "images are fitted to the training split of these cameras and scored over the test split, "
+        "or over other automatic views if it has fewer than four; every try is written and read, "
+        "which takes long for .sog",
     )
     size.add_argument(
         "--target-ssim",
@@ -274,7 +277,7 @@ def _simplify_in_memory(
     if search:
         config = with_limited_bands(config, options.sh_degree)
     cameras, own, chosen = read_cameras(options), None, None
-    if cameras is None and (config.uses_images or options.time_budget is not None):
+    if cameras is None and (search or config.uses_images or options.time_budget is not None):
         own = own_cameras(options, scene, options.input)
         cameras = None if own is None else own.cameras
     if options.time_budget is not None:
@@ -285,8 +288,11 @@ def _simplify_in_memory(
         )
         config = cvtgs.SimplifyConfig.compose(preset=chosen.name, settings=settings)
         notes.append(chosen.reason)
-    if own is not None and config.uses_images:
-        many = counted(len(own.cameras), "camera")
+    views = views_of_search(options, config, cameras, own) if search else None
+    if views is not None:
+        cameras = views.cameras
+    if own is not None and cameras is not None and config.uses_images:
+        many = counted(len(cameras), "camera")
         notes.append(f"Rendered from {many} found in {own.source.resolve()}.")
     simplifier = cvtgs.Simplifier(
         checkpoint_of(options),
@@ -294,9 +300,9 @@ def _simplify_in_memory(
         device=options.device,
         listener=silent if search else listener,
     )
-    if search:
+    if views is not None:
         found, scores = search_target(
-            options, scene, simplifier, cameras=cameras, axes=axes.target, listener=listener
+            options, scene, simplifier, views=views, axes=axes.target, listener=listener
         )
         small, report = found.scene, found.report
         if options.sh_degree is not None:
