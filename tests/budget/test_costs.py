@@ -62,6 +62,24 @@ def test_loading_counts_once_and_images_need_more_libraries():
     assert model.seconds(work, preset("matched")) == 4.25
 
 
+@pytest.mark.parametrize(("name", "more"), [("matched", 1012.0), ("standard", 0.0)])
+def test_given_cameras_make_cells_be_allocated_twice_by_errors_of_images(name, more):
+    """One more allocation, network and pass over 10 Gaussians in; 100 for each of 10 images."""
+    rates = {"check": {"in": 5.0}, "allocate": {"once": 1.0}, "merge": {"in": 1.0}}
+    rates |= {"network": {"once": 1.0}, "refine": {"once": 7.0, "looks_out": 50.0}}
+    model, work = CostModel(rates=rates), Work(count=10, target=2)
+    config = preset(name).model_copy(update={"match": preset("matched").match})
+    if name == "matched":
+        visibility = config.visibility.model_copy(update={"views": 10})
+        config = config.model_copy(update={"visibility": visibility})
+    plain, given = (
+        model.seconds(work, config, with_cameras=with_cameras) for with_cameras in (False, True)
+    )
+    assert given - plain == more
+    whole = Work(count=10, target=10)
+    assert model.seconds(whole, config, with_cameras=True) == model.seconds(whole, config)
+
+
 def test_pixel_gaussian_pairs_grow_with_the_square_root_of_both():
     matched = preset("matched")
     few, many = (

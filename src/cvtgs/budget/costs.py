@@ -35,6 +35,9 @@ FEATURES: Mapping[str, tuple[str, ...]] = {  # of each stage; its seconds are li
     NETWORK: ("once", "in", "sampled", "sampled_values", "out", "out_values"),
 }
 
+GROUPING = ("filter", "weigh", "tessellate", "allocate", "merge", NETWORK)
+"""Stages that run twice with given cameras, by whose images cells are allocated again."""
+
 OTHER_FEATURES = ("once", "in", "out")  # features of all other stages
 SHARE_OF_A_STEP = 0.2  # cost of rendering an image without gradients, as a share of a step
 STEPS_OF_A_BATCH = 8.0  # cost of generating one batch of views of any size, in steps
@@ -203,12 +206,15 @@ class CostModel(Record, allow_inf_nan=False):
             )
         return cls(rates=rates, start=start, image_start=image_start)
 
-    def stage_seconds(self, work: Work, config: SimplifyConfig) -> dict[str, float]:
+    def stage_seconds(
+        self, work: Work, config: SimplifyConfig, *, with_cameras: bool = False
+    ) -> dict[str, float]:
         """Predict the cost of each stage that a configuration has.
 
         Args:
             work: Size of the simplification.
             config: Configuration of the simplification.
+            with_cameras: Whether cameras are given: by their images, cells are allocated twice.
 
         Returns:
             Wall-clock seconds by stage; a scene that stays whole is only checked and analysed.
@@ -228,14 +234,27 @@ class CostModel(Record, allow_inf_nan=False):
         limit = config.refine.seconds
         if REFINE in seconds and limit:
             seconds[REFINE] = min(seconds[REFINE], limit) if config.refine.steps else limit
+        allocates_again = with_cameras and config.uses_renders and config.match.error_power > 0
+        if allocates_again and not is_whole:
+            seconds |= {stage: 2 * seconds[stage] for stage in GROUPING if stage in seconds}
+            seconds["errors"] = self._seconds_of_errors(work, config)
         return seconds
 
-    def seconds(self, work: Work, config: SimplifyConfig) -> float:
+    def _seconds_of_errors(self, work: Work, config: SimplifyConfig) -> float:
+        """Predict the cost of images with one gradient each: that of as many in refinement."""
+        visibility, rates = config.visibility, self.rates.get(REFINE, {})
+        pixels = (visibility.size / visibility.stride) ** 2
+        of_one = {"looks": 1.0, "look_pixels": pixels, "looks_out": float(work.target)}
+        each = sum(rates.get(name, 0.0) * amount for name, amount in of_one.items())
+        return visibility.views * each
+
+    def seconds(self, work: Work, config: SimplifyConfig, *, with_cameras: bool = False) -> float:
         """Predict the cost of a simplification.
 
         Args:
             work: Size of the simplification.
             config: Configuration of the simplification.
+            with_cameras: As for :meth:`stage_seconds`.
 
         Returns:
             Wall-clock seconds of the first simplification of a process, from the scene in memory
@@ -247,7 +266,8 @@ class CostModel(Record, allow_inf_nan=False):
             4.5
         """
         start = self.start + (self.image_start if config.uses_images else 0.0)
-        return start + sum(self.stage_seconds(work, config).values())
+        stages = self.stage_seconds(work, config, with_cameras=with_cameras)
+        return start + sum(stages.values())
 
 
 def fit_rates(

@@ -308,7 +308,8 @@ def choose_preset(
             ``{"visibility.views": "0"}``.
         model: The cost of presets; None for :func:`cvtgs.budget.cost_model`, which measures it once
             on this machine.
-        cameras: Cameras to render from, if they are given: a few make fewer images than presets do.
+        cameras: Cameras to render from, if they are given: a few make fewer images than presets do,
+            and their errors take a second allocation.
         with_images: Whether presets that render images may be chosen, which need 400 MB more.
 
     Raises:
@@ -341,7 +342,7 @@ def choose_preset(
     if cameras is not None:
         configs = {name: _with_views(one, most=len(cameras)) for name, one in configs.items()}
     costs = {
-        name: known.seconds(work, config)
+        name: known.seconds(work, config, with_cameras=cameras is not None)
         for name, config in configs.items()
         if with_images or not config.uses_images
     }
