@@ -115,8 +115,14 @@ class Job:
     def file_bytes(self) -> int:
         """Estimate of the bytes of all files of the job, when they take most, and of the output."""
         cells = joint_cells(self.target, self.source.count, self.cell_room, self.config.allocation)
-        rounds = 2 if self.allocates_again else 1
-        return step_bytes(self.source, cells=cells, kept=self.target, rounds=rounds)
+        return step_bytes(
+            self.source,
+            cells=cells,
+            kept=self.target,
+            blocks=self.blocks,
+            with_images=self.config.uses_images,
+            views=self.config.visibility.views if self.allocates_again else 0,
+        )
 
     @property
     def targets_path(self) -> Path:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch
 
+from cvtgs.cells.moments import MAX_COMPONENTS
 from cvtgs.config import AllocationConfig
 from cvtgs.counts import checked_whole, whole_number
 from cvtgs.devices import core_count
@@ -40,14 +41,21 @@ components of view-dependent colour."""
 MERGING_BYTES = 230  # the same in one piece, beyond what rows take in other stages
 ORDER_BYTES = 256  # of each Gaussian, likewise, from the second of several levels on
 KEPT_BYTES = 500  # of each Gaussian that is kept, likewise, which counts where these are most
-# Bytes of files on disk, measured with 100,000 to a million Gaussians:
+# Bytes of files on disk, measured with 20,000 to a million Gaussians:
 SCAN_BYTES = 9_000_000  # the grid of depths
+FOLDER_BYTES = 20_000  # of each block: headers and reports
 ROW_BYTES = 12  # of each row beyond those of the source
-POINT_BYTES = 58  # of each row: its order, its cell, the sample of Lloyd, rows that are sent
-JOINT_BYTES = 380  # of each cell: sites, sums of their points, moments of parts
-GROUP_BYTES = 192  # of each Gaussian that is kept: moments and neighbours
+POINT_BYTES = 60  # of each row: its order, its cell, the sample of Lloyd
+SENT_SHARE = 1.25  # of the rows leave for a cell of another block, if each block has one cell
+SITE_BYTES = 256  # of each cell: sites before and after two iterations, sums of their points
+PART_BYTES = 128  # of each cell: moments of its parts
+GROUP_BYTES = 288  # of each Gaussian that is kept: moments and neighbours, of groups and of cells
+COMPONENT_BYTES = 8  # of each component of view-dependent colour in moments
 STREAM_PART = 6  # divides the bytes of a row: about what a Gaussian of a stream takes
-RESULTS = 4  # in rows of the source: merged, inflated, corrected and written
+RESULTS = 3  # in rows of the source: merged, inflated and corrected
+SAMPLE_BYTES = 56  # of each Gaussian of the sample that images show
+IMAGE_ROW_BYTES = 16  # of each row: contributions to images, and its cell before the second round
+ERROR_BYTES = 12  # of each Gaussian that is kept, by image: most errors count in several blocks
 
 WRITING_ROWS = 5  # in rows of the file: what a format takes that is written from memory
 CELL_ROOM = 1 << 20  # number of cells that may merge together if no memory is given
@@ -237,14 +245,26 @@ def stream_bytes(source: PlyRows, gaussians: int) -> int:
     return sorted_bytes(source) + gaussians * source.dtype.itemsize // STREAM_PART
 
 
-def step_bytes(source: PlyRows, *, cells: int, kept: int, rounds: int = 1) -> int:
-    """Estimate the bytes of the files of all steps; cells cross the borders of blocks.
+def step_bytes(
+    source: PlyRows, *, cells: int, kept: int, blocks: int, with_images: bool, views: int
+) -> int:
+    """Estimate the bytes of the files of all steps, and of the output.
 
-    Those of the tessellation and of the cells exist once in every of ``rounds`` allocations.
+    With the errors of some ``views``, cells are allocated again, and their files exist twice.
     """
-    results = kept * (RESULTS * source.dtype.itemsize + GROUP_BYTES)
-    files = source.count * POINT_BYTES + cells * JOINT_BYTES + results
-    return sorted_bytes(source) + rounds * files
+    # Few cells of large blocks cross their borders: as many as surface to volume.
+    share = min(1.0, SENT_SHARE * math.pow((blocks - 1) / cells, 1 / 3))
+    row, names = source.dtype.itemsize, source.dtype.names or ()
+    components = min(MAX_COMPONENTS, sum(name.startswith("f_rest_") for name in names))
+    sent = share * source.count * (row + ROW_BYTES)
+    parts = (1.0 + share) * cells * (PART_BYTES + COMPONENT_BYTES * components)
+    groups = kept * (GROUP_BYTES + COMPONENT_BYTES * components + RESULTS * row)
+    files = source.count * POINT_BYTES + cells * SITE_BYTES + blocks * FOLDER_BYTES + kept * row
+    if with_images:
+        files += source.count * IMAGE_ROW_BYTES + kept * (row + views * ERROR_BYTES)
+        files += min(source.count, 2 * SAMPLE_ROWS) * SAMPLE_BYTES
+    rounds = 2 if views else 1
+    return sorted_bytes(source) + math.ceil(files + rounds * (sent + parts + groups))
 
 
 def warn_of_full_disk(folder: str, needed: int) -> None:
