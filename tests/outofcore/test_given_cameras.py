@@ -376,7 +376,7 @@ def test_cameras_that_are_not_used_are_named(capsys, tmp_path, scene):
     cvtgs.save(scene, tmp_path / "in.ply")
     cameras = write_json(tmp_path / "cameras" / "transforms.json", transforms())
     words = ["simplify", tmp_path / "in.ply", tmp_path / "out.ply", "--preset", "draft"]
-    words += ["--memory", "800MB", "--workers", "1", "--rho", "0.05", "--cameras", cameras]
+    words += ["--memory", "1GB", "--workers", "1", "--rho", "0.05", "--cameras", cameras]
     assert main([str(word) for word in words]) == 0
     assert "--cameras was not used: draft renders no images" in " ".join(
         capsys.readouterr().out.split()

@@ -31,7 +31,9 @@ SMALL_BASE_BYTES = LIBRARY_BYTES + 70_000_000  # the same with a quarter of the 
 ROOMY_BYTES = LIBRARY_BYTES + 220_000_000  # with less memory than this, the sample is small
 PLAIN_ROW = 68  # bytes of a row without view-dependent colour, for which these figures hold
 WORKER_BYTES = 2 * ROOMY_BYTES  # of each process that works on blocks: torch, a larger block
-LEAST_BYTES = LIBRARY_BYTES + 120_000_000  # of a run in blocks: the small base, a small block
+LEAST_BYTES = LIBRARY_BYTES + 180_000_000
+"""Of a run in blocks: the small base, a small block, and 60 MB for a sample of degree 3."""
+SMALL_BLOCK_BYTES = 50_000_000  # of a block with the least memory
 IMAGE_BYTES = 400_000_000  # memory reserved for images of the scene and their intermediate data
 
 CELL_BYTES = 1500
@@ -39,7 +41,7 @@ CELL_BYTES = 1500
 components of view-dependent colour."""
 
 MERGING_BYTES = 230  # the same in one piece, beyond what rows take in other stages
-ORDER_BYTES = 256  # of each Gaussian, likewise, from the second of several levels on
+ORDER_BYTES = 336  # of each Gaussian, likewise, from the second of several levels on
 KEPT_BYTES = 500  # of each Gaussian that is kept, likewise, which counts where these are most
 # Bytes of files on disk, measured with 20,000 to a million Gaussians:
 SCAN_BYTES = 9_000_000  # the grid of depths
@@ -175,7 +177,7 @@ def base_bytes(memory: int) -> int:
     """Return the bytes of a run without its blocks; with little memory, blocks get a fixed rest."""
     if memory >= ROOMY_BYTES:
         return BASE_BYTES
-    return max(SMALL_BASE_BYTES, memory - (LEAST_BYTES - SMALL_BASE_BYTES))
+    return max(SMALL_BASE_BYTES, memory - SMALL_BLOCK_BYTES)
 
 
 def sample_rows(memory: int, source: PlyRows) -> int:
