@@ -281,6 +281,18 @@ def test_cells_have_the_same_neighbours_as_in_one_piece(job):
     assert crossed > TARGET // 5
 
 
+def test_no_neighbours_are_searched_that_nothing_uses(tmp_path):
+    """The published network sees single cells, and ``paper`` neither aligns nor inflates them."""
+    scene, config = (
+        cvtgs.synthetic.scene("object", 400, sh_degree=0),
+        SimplifyConfig(preset="paper"),
+    )
+    job = unfinished_job(scene, tmp_path, count=40, blocks=2, config=config)
+    for block in job.blocks_with_cells():
+        found = job.read("inflated", block)
+        assert (found["remote"].shape, found["neighbors"].shape[1]) == ((0, 2), 0)
+
+
 def test_axes_and_inflation_are_the_same_as_in_one_piece(job):
     merged, inflated = scene_of_all(job, "merged"), scene_of_all(job, "inflated")
     sizes = of_all(job, "merged", "sizes")

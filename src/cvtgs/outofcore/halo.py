@@ -129,6 +129,8 @@ def halo_cells(
     centers: Float[Tensor, "m 3"], others: Iterable[OtherBlock], *, count: int
 ) -> Int[Tensor, "h 2"]:
     """Return block and number of remote cells that may be among an own cell's ``count`` nearest."""
+    if count == 0:
+        return torch.zeros(0, 2, dtype=torch.int64)
     centers = centers.double()
     if len(centers) > count:
         _, distances = nearest_several(centers, centers, count + 1)

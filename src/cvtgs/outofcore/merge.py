@@ -84,7 +84,9 @@ def inflate(job: Job, block: int) -> None:
         return
     own = job.read("merged", block)
     own_count = len(own["sizes"])
-    near = neighbor_count(job.config.merge, with_network=job.has_network)
+    net = job.read_network(own["means"].dtype)
+    sees = net is not None and net.sees_surroundings
+    near = neighbor_count(job.config.merge, with_network=sees)
     numbers = [other for other in job.blocks_with_cells() if other != block]
     others = other_blocks(job, "merged", "means", numbers)
     remote = halo_cells(own["means"], others, count=near)
