@@ -115,8 +115,8 @@ def add_simplify(add_parser: AddParser) -> None:
         type=seconds,
         metavar="TIME",
         help="time limit, for example 30s, of refining the result against images of IN, as long as "
-        "held-out views improve; rendering the first images counts; 0 turns off the refinement of "
-        "a preset",
+        "held-out views improve; finding views and rendering the first images counts, and takes "
+        "seconds on a CPU, even if TIME is less; 0 turns off the refinement of a preset",
     )
     parser.add_argument(
         "--refine-steps", type=int, metavar="N", help="step limit of refining the result"

@@ -77,7 +77,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     The same scenes, steps, configuration and seed give the same bits on a CPU; with ``seconds``
     the number of steps depends on the clock. The time includes everything, even the compilation
     of numba code at its first use on a machine, some ten seconds. Views and held-out images come
-    first, a second or more on a CPU; if then no step fits, a warning says so.
+    first, one to five seconds on a CPU, also if that is longer than ``seconds``; if then no step
+    fits, a warning says so, and the scene is unchanged.
 
     Memory: ten times the small scene, 80 more bytes per Gaussian for each further image of a step,
     the memory for rendering the full scene, and the reused images (those of given cameras), at most
