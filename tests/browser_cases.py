@@ -35,17 +35,21 @@ needs_browser = pytest.mark.skipif(
 
 
 def layout_on_a_phone(path: Path) -> str:
-    """Return the layout in a frame of a phone's width, since a window cannot be that narrow."""
-    holder = path.parent / "phone.html"
+    """Return the layout at a phone's width."""
+    return in_frame(path, "page.dataset.layout + ' ' + page.scrollWidth", width=390)
+
+
+def in_frame(path: Path, expression: str, *, width: int) -> str:
+    """Evaluate JavaScript on ``page``, in a frame, since a window has no width of a phone."""
+    holder = path.parent / "frame.html"
     holder.write_text(
-        f'<iframe id="phone" src="{path.name}" style="width:390px;height:800px;border:0"></iframe>'
-        "<script>setTimeout(() => { const page = phone.contentDocument.documentElement;"
-        "document.documentElement.dataset.layout = page.dataset.layout + ' ' + "
-        "page.scrollWidth; }, 1500)</script>",
+        f'<iframe id="shown" src="{path.name}" style="width:{width}px;height:800px;border:0">'
+        "</iframe><script>setTimeout(() => { const page = shown.contentDocument.documentElement;"
+        f"document.documentElement.dataset.found = {expression}; }}, 1500)</script>",
         encoding="utf-8",
     )
     html = browse(holder, "", "--allow-file-access-from-files", "--dump-dom")
-    return attribute(html, "layout")
+    return attribute(html, "found")
 
 
 def browse(path: Path, hash_: str, *arguments: str) -> str:

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 import cvtgs
-from browser_cases import attribute, dom, layout_on_a_phone, needs_browser
+from browser_cases import attribute, dom, in_frame, layout_on_a_phone, needs_browser
 from cvtgs.errors import ConfigError, InvalidArgumentError, RunError
 from cvtgs.evaluation import Evaluation, EvaluationSettings, SceneScores, Score, compare
 from cvtgs.tradeoff import (
@@ -167,7 +167,10 @@ def test_the_page_escapes_texts_and_names_failures():
     assert "<img" not in html
     assert "max 0.1 failed: a &lt; b." in html
     assert html.count('class="best"') == 6
-    assert 'src="data:image/png;base64,' in page_summary(made, b"png")
+    assert "hollow" not in html
+    html = page_summary(made, b"png")
+    assert 'src="data:image/png;base64,' in html
+    assert "(other points of the chart are hollow)." in html
 
 
 def test_ticks_are_round_numbers():
@@ -365,6 +368,20 @@ def test_the_page_has_plot_table_and_slider(page):
 def test_the_page_fits_a_phone(page):
     """The wide table scrolls in its own container."""
     assert layout_on_a_phone(page) == "390/390 390"
+
+
+@needs_browser
+@pytest.mark.slow
+def test_a_large_screen_shows_all_columns(measured, tmp_path):
+    names = ("plan", "visibility", "weigh", "tessellate", "allocate", "merge", "network", "refine")
+    runs = (result("high", 9.0, 31.0, stages=dict.fromkeys(names, 12.5)), MADE[0])
+    scored = measured.tradeoff.model_copy(update={"results": runs})
+    path = write_tradeoff(measured._replace(tradeoff=scored), tmp_path).paths[-1]
+    table = "page.querySelector('#tradeoff').parentElement"
+    assert in_frame(path, f"{table}.scrollWidth - {table}.clientWidth", width=1600) == "0"
+    assert in_frame(path, f"{table}.clientWidth > 1016", width=1600) == "true"
+    assert in_frame(path, "page.scrollWidth", width=1600) == "1600"
+    assert in_frame(path, f"{table}.clientWidth", width=1080) == "1016"
 
 
 @pytest.mark.slow
