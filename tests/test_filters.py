@@ -84,6 +84,7 @@ def test_the_mass_of_dropped_gaussians_is_bounded(share):
     assert bool(keep[scene.opacities >= 0.5].all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "count"), [("object", 3000), ("courtyard", 2500)])
 def test_what_training_would_prune_does_not_spoil_its_neighbours(kind, count):
     scene, g = cvtgs.synthetic.scene(kind, 2000, sh_degree=0), torch.Generator().manual_seed(0)

@@ -57,6 +57,7 @@ def test_a_process_that_has_loaded_torch_keeps_its_settings(monkeypatch):
     assert not any(name in os.environ for name in NAMES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "wanted"),
     [

@@ -220,6 +220,7 @@ def test_autocast_does_not_change_scenes():
     assert same_bits(found, wanted)
 
 
+@pytest.mark.slow
 def test_threads_make_the_same_scenes_whatever_the_default_dtype():
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)

@@ -240,6 +240,7 @@ def test_images_of_a_view_are_small_whatever_the_window(
     assert (cameras.width, cameras.height) == size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "odd",
     [

@@ -115,6 +115,7 @@ def control(label: str) -> Any:
     return viser_stand_in.ViserServer.latest.gui.controls[label]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["/tmp/a.ply", "../a.ply", "a/../../b.ply", "C:a.ply", "a\\b.ply"])
 def test_scenes_are_saved_in_the_folder_of_the_program(page: Any, name: str) -> None:
     control("file").value = name

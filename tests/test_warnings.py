@@ -71,6 +71,7 @@ CALLS: dict[str, Call] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CALLS)
 def test_a_warning_points_at_the_program(name: str, tmp_path: Path) -> None:
     scene = make("object", 300, sh_degree=1)

@@ -269,6 +269,7 @@ def test_share_of_duplicates(count, copies, dtype):
     assert found == pytest.approx(1 - 1 / copies, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("count", [8000, 200_000])
 @pytest.mark.parametrize("step", [1.0, 1 / 64, 1 / 4096])

@@ -45,6 +45,7 @@ def tagged(scene: GaussianScene) -> GaussianScene:
     return GaussianScene(**scene.tensors(), comments=("made up", ANTIALIASED.text))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("above", [0, 1, 2])
 def test_empty_bands_are_neither_merged_nor_predicted(above, preset, monkeypatch):
@@ -263,6 +264,7 @@ def test_images_are_compensated_as_planned_and_the_tag_stays(is_tagged, choice, 
     assert small.comments == scene.comments
 
 
+@pytest.mark.slow
 def test_images_decide_on_haze_by_the_mass_that_they_show():
     config = SimplifyConfig.from_mapping({"visibility": {"views": 2, "size": 32}})
     scene = random_scene(100, dtype=torch.float64)

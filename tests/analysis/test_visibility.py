@@ -89,6 +89,7 @@ def test_haze_stays_open():
     assert float(found.mean()) > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-3, 1e3])
 def test_the_unit_of_length_and_the_place_do_not_matter(size):
     points = torch.randn(500, 3, generator=torch.Generator().manual_seed(1)).double()

@@ -39,6 +39,7 @@ def test_pictures_are_laid_out_as_nerf_s_with_an_eighth_for_testing(dataset):
     torch.testing.assert_close(test[1][0], over_white, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_cameras_and_pictures_belong_together(dataset):
     """The generated scene, seen by the cameras of the files, matches its pictures."""
     cameras, photographs = read_split(dataset, "test", SIZE)

@@ -11,6 +11,7 @@ from cvtgs.synthetic import scene as make
 from cvtgs.views.layout import find_layout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (90.0, 0.0, 0.0), (180.0, 0.0, 0.0)])
 def test_scenes_are_turned_upright(angles):
     """Whichever way up a scene is, its up points to -y afterwards."""

@@ -53,6 +53,7 @@ def test_members_that_are_alike_or_bright_keep_their_mean(degree):
     assert same_bits(plain, raised)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", range(4))
 def test_cells_show_the_colours_of_their_members(degree):
     """The error of the mean of what images show, in all directions, at least halves."""
@@ -77,6 +78,7 @@ def test_cells_show_the_colours_of_their_members(degree):
     assert raised < 0.5 * plain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blocks", [1, 4])
 def test_blocks_are_as_bright(tmp_path, blocks):
     scene = synthetic.scene("object", 4000, sh_degree=1, seed=0)

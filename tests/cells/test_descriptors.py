@@ -67,6 +67,7 @@ def test_two_round_members_side_by_side():
     assert seen.weights.tolist() == [0.5, 0.5]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("near", [0, 1, 8])
 @pytest.mark.parametrize(("seed", "tagged"), [(0, False), (1, True), (2, False)])
 def test_descriptors_equal_the_oracle(seed, tagged, near):

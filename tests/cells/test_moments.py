@@ -63,6 +63,7 @@ def assert_equals_oracle(scene, cells, config, *, tolerance: float) -> None:
         )
 
 
+@pytest.mark.slow
 @each_rule
 @pytest.mark.parametrize(("total", "count"), [(2, 1), (50, 1), (200, 20), (300, 150)])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 3e-5), (torch.float64, 1e-9)])

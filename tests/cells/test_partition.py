@@ -51,6 +51,7 @@ def test_cells_of_several_members():
         assert lists_of(several) == lists_of(partition)[::2]
 
 
+@pytest.mark.slow
 def test_no_device_synchronization_where_sizes_are_known():
     partition = partition_of([2, 1, 3, 1])
     first = partition.order[partition.offsets[2]]

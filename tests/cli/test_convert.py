@@ -86,6 +86,7 @@ def test_unwritable_formats_are_refused_before_reading(
     assert f"must end in {ends}" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", FORMATS)
 @pytest.mark.parametrize("second", FORMATS)
 def test_every_format_converts_to_every_other(tmp_path: Path, first: str, second: str) -> None:
@@ -99,6 +100,7 @@ def test_every_format_converts_to_every_other(tmp_path: Path, first: str, second
     assert float(distances.max()) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", FORMATS[1:])
 def test_simplify_and_info_accept_every_format(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], end: str

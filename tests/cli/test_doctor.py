@@ -115,6 +115,7 @@ def test_an_unknown_device_is_refused(capsys):
     assert "device 'nowhere' cannot be used here" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("build", "reason"), [(None, "is built for CPUs only"), ("13.0", "no driver for 13.0 or later")]
 )

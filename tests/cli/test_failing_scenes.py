@@ -148,6 +148,7 @@ def test_errors_name_their_scene(capsys: pytest.CaptureFixture[str]) -> None:
     assert first.startswith("cvtgs: error: [1/2] 1: count must be a whole number between 1 and")
 
 
+@pytest.mark.slow
 def test_a_scene_that_failed_is_freed(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[weakref.ref[cvtgs.GaussianScene]] = []
     is_freed = []

@@ -107,6 +107,7 @@ def test_a_large_scene_is_streamed_in_blocks(
     assert document["root"]["transform"][12:15] == pytest.approx((4276e3, 639e3, 4672e3), abs=2e3)
 
 
+@pytest.mark.slow
 def test_the_suffix_of_a_scene_in_blocks_may_be_in_capitals(
     tmp_path: Path, words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -213,6 +214,7 @@ def test_a_level_does_not_replace_its_scene(tmp_path, capsys):
     assert [one.name for one in tmp_path.iterdir()] == ["rho_0.5.ply"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "chunk"), [("sog", "0_0_0"), ("3dtiles", "0_0.glb")])
 def test_a_stream_does_not_replace_its_scene(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, chunk: str
@@ -238,6 +240,7 @@ def test_a_stream_does_not_replace_its_scene(
     assert beside.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
 @pytest.mark.parametrize(
     ("count", "valid", "levels"),
@@ -266,6 +269,7 @@ def test_a_page_shows_a_scene_that_is_named_like_a_level(tmp_path, monkeypatch):
     assert {name: len(one) for name, one in shown.items()} == {str(path): 30, "rho_0.5.ply": 15}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [[], ["--axes", "rdf"], ["--axes", "rub"]])
 def test_turned_scenes_are_not_scored_from_cameras_beside_them(
     tmp_path: Path, words: list[str], axes: list[str], capsys: pytest.CaptureFixture[str]

@@ -90,6 +90,7 @@ def test_the_number_of_kept_gaussians_is_printed(capsys, source):
     assert f"{kept} Gaussians in the boxes of --keep." in simplified(capsys, source, *words)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("suffix", "axes"),
     [(".ply", ()), (".compressed.ply", ()), (".spz", ()), (".spz", ("--axes", "rdf:rub"))],
@@ -175,6 +176,7 @@ def test_cameras_that_are_not_used_are_mentioned(capsys, source):
     assert "--cameras" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "text"),
     [

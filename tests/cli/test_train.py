@@ -89,6 +89,7 @@ def test_the_summary_says_that_matplotlib_is_missing(again, tmp_path, capsys, mo
     )
 
 
+@pytest.mark.slow
 def test_each_validation_gets_a_line_before_the_summary(again, made, tmp_path, capsys):
     assert main(again) == 0
     printed = capsys.readouterr()
@@ -120,12 +121,14 @@ def test_the_lowest_gain_is_printed(capsys):
     )
 
 
+@pytest.mark.slow
 def test_quiet_prints_nothing(again, capsys):
     assert main([*again, "--quiet"]) == 0
     captured = capsys.readouterr()
     assert (captured.out, captured.err) == ("", "")
 
 
+@pytest.mark.slow
 def test_an_existing_checkpoint_is_replaced_only_when_asked(again, made, tmp_path, capsys):
     output = tmp_path / "net.safetensors"
     output.write_text("precious")

@@ -20,6 +20,7 @@ def source(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("other", ["IN", "OUT", "--config", "--keep", "--cameras"])
 @pytest.mark.parametrize("spelling", ["same", "dots", "symlink", "hard link"])
 def test_the_report_never_replaces_another_file(

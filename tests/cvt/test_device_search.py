@@ -42,6 +42,7 @@ def assert_found(points, sites, count):
     torch.testing.assert_close(own, wanted, rtol=1e-9, atol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [1, 3, 6])
 @pytest.mark.parametrize("count", [1, 4, 9])
 @pytest.mark.parametrize("sites", [9, 17, 100, 1000])
@@ -56,6 +57,7 @@ def test_scenes_of_any_scale(scale):
     assert_found(scale * cloud(500, 3), scale * cloud(200, 3, seed=1), 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 9])
 @pytest.mark.parametrize("far", [1e3, 1e12, 1e30])
 def test_a_few_sites_and_points_far_away(far, count):

@@ -82,6 +82,7 @@ def test_known_points(backend):
     assert squared.tolist() == pytest.approx([1.0, 5.0, 13.0, 25.0])
 
 
+@pytest.mark.slow
 @both
 @dtypes
 @pytest.mark.parametrize("d", [1, 2, 3, 6])

@@ -42,6 +42,7 @@ def views_of(scene: GaussianScene, blind: int) -> tuple[Cameras, Cameras]:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blind", [0, 1, 3])
 def test_blind_views_do_not_count_in_means(scene, small, blind):
     good, both = views_of(scene, blind)
@@ -77,6 +78,7 @@ def test_a_view_of_something_tiny_counts():
     assert math.isfinite(found.psnr.mean)
 
 
+@pytest.mark.slow
 def test_a_search_does_not_measure_blind_views(scene):
     good, both = views_of(scene, 3)
     simplifier = Simplifier(preset="fast", device="cpu")

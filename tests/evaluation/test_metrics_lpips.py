@@ -42,6 +42,7 @@ def lpips_by_numpy(network: str, first: np.ndarray, second: np.ndarray) -> float
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("network", "size"),
     [("alex", (31, 31)), ("alex", (50, 37)), ("vgg", (16, 16)), ("vgg", (19, 34))],
@@ -58,6 +59,7 @@ def test_lpips_equals_that_by_numpy(network, size) -> None:
     assert single.item() == pytest.approx(wanted, rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("network", ["alex", "vgg"])
 def test_lpips_is_0_for_equal_images_symmetric_and_grows_with_noise(network) -> None:
     side = {"alex": 31, "vgg": 16}[network]

@@ -128,6 +128,7 @@ def check_that_the_order_of_members_changes_nothing(scene, config):
 # With a network
 
 
+@pytest.mark.slow
 @dtypes
 @each_case
 def test_each_case_with_a_network(make, dtype, subtests):

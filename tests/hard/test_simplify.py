@@ -140,6 +140,7 @@ def check_a_turn(make, preset):
         assert second.energy <= 1.5 * first.energy + 1e-12
 
 
+@pytest.mark.slow
 @presets
 @pytest.mark.parametrize("name", ["isotropic_cells", "giants"])
 def test_scenes_with_equal_distances_give_the_same_image(name, preset):

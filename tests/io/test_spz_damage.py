@@ -142,6 +142,7 @@ def test_a_false_count_takes_no_memory(tmp_path: Path, count: int) -> None:
     assert peak < 4 << 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("members", [1, 2])
 def test_surplus_data_is_not_unpacked(tmp_path: Path, members: int) -> None:
     """The file holds 256 MiB of zeros after 40 Gaussians."""

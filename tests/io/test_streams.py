@@ -62,6 +62,7 @@ def test_no_threads_spin_while_files_are_written(two_threads, monkeypatch) -> No
     assert (counts, torch.get_num_threads()) == ([1], 2)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
 @pytest.mark.parametrize("end", FORMATS)
 def test_bytes_do_not_depend_on_the_number_of_threads(two_threads, end: str) -> None:

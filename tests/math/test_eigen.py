@@ -50,6 +50,7 @@ def test_diagonal_matrices_stay_exact():
     assert axes[1].tolist() == torch.eye(3).tolist()
 
 
+@pytest.mark.slow
 def test_one_sweep_less_is_enough(monkeypatch):
     made = torch.randn(2000, 3, 3, generator=torch.Generator().manual_seed(0)).double()
     made = made + made.mT

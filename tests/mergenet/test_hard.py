@@ -88,6 +88,7 @@ def test_descriptors_are_finite_and_of_bounded_size(change, dtype):
     assert bool((seen.weights >= 0).all())
 
 
+@pytest.mark.slow
 @dtypes
 @each_hard
 def test_corrected_gaussians_are_finite(change, dtype):
@@ -99,6 +100,7 @@ def test_corrected_gaussians_are_finite(change, dtype):
     assert float((norms - 1).abs().amax()) < 1e-5
 
 
+@pytest.mark.slow
 @dtypes
 @each_hard
 def test_gradients_of_all_parameters_are_finite(change, dtype):
@@ -124,6 +126,7 @@ def test_a_network_with_huge_weights_gives_finite_gaussians(factor, dtype):
     assert_finite(case.correct(net).tensors())
 
 
+@pytest.mark.slow
 @dtypes
 @pytest.mark.parametrize("log_scale", [-800.0, -400.0, -40.0, 88.0])
 @pytest.mark.parametrize("beside", [0.0, 1.0, 1e30])

@@ -55,6 +55,7 @@ def stopped_in(source, output, stage, nth):
     return next(output.parent.glob(".out.ply.blocks/*"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stage", "nth"), [("errors", 1), ("allocate", 2), ("merge", 2), ("blocks", 2), ("images", 1)]
 )
@@ -75,6 +76,7 @@ def test_a_run_continues_in_the_second_allocation(source, whole, tmp_path, stage
     assert not folder.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [
@@ -92,6 +94,7 @@ def test_damaged_files_of_both_allocations_are_made_again(source, whole, tmp_pat
     assert output.read_bytes() == whole
 
 
+@pytest.mark.slow
 def test_the_output_of_unmatched_blocks_has_the_wanted_axes(source, tmp_path):
     """Only the last of the simplified blocks is written in the axes of the output."""
     found = {}

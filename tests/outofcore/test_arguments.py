@@ -75,6 +75,7 @@ def test_the_source_is_a_path(source):
         simplify_file(None, source.with_name("out.ply"), 0.1)
 
 
+@pytest.mark.slow
 def test_numbers_may_be_of_numpy(source):
     numbers = {"blocks": 2, "memory": 10**9, "sh_degree": 0, "range_rows": 100}
     for name, change in {"own": int, "numpy": np.int64}.items():

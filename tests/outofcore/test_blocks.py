@@ -255,6 +255,7 @@ def test_invalid_rows_are_dropped_and_flyaways_do_no_harm(tmp_path):
     assert not cvtgs.validity.invalid_rows(cvtgs.load(tmp_path / "out.ply"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_target_below_the_number_of_blocks_is_met(source, tmp_path, count):
     report = simplify_file(source, tmp_path / "out.ply", count=count, blocks=8)

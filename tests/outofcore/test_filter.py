@@ -20,6 +20,7 @@ def scene() -> GaussianScene:
     return scene.with_tensors(logit_opacities=logits)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [OPAQUE, OPAQUE + 1, OPAQUE + 200, 1500, COUNT - 1])
 @pytest.mark.parametrize("preset", ["paper", "standard"])
 def test_blocks_leave_out_the_same_gaussians(scene, tmp_path, preset, target) -> None:
@@ -55,6 +56,7 @@ def test_the_faintest_of_a_haze_are_left_out_up_to_its_share(scene, tmp_path) ->
     assert 10 < whole.filtered_count < 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [400, 1000])
 def test_a_sample_leaves_few_more_than_wanted(scene, tmp_path, rows, monkeypatch) -> None:
     """With as many as the sample predicts, half of all runs would have too few, and no filter."""
@@ -73,6 +75,7 @@ def test_a_sample_leaves_few_more_than_wanted(scene, tmp_path, rows, monkeypatch
         assert target <= kept <= target * (1 + 8 * (rows * target / COUNT) ** -0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "standard"])
 def test_shares_of_mass_are_those_of_the_whole_scene(scene, tmp_path, preset) -> None:
     cvtgs.save(scene, tmp_path / "in.ply")

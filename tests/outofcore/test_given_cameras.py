@@ -68,6 +68,7 @@ def test_cameras_that_miss_the_scene_are_refused(source, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blind", [5, 6])
 def test_cameras_most_of_which_see_nothing_are_a_warning_as_in_one_piece(
     scene, source, tmp_path, blind
@@ -95,6 +96,7 @@ def test_a_refinement_by_one_camera_that_sees_is_refused_as_in_one_piece(scene, 
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_cameras_see_protected_rows_too(two_objects, tmp_path):
     """Eight of ten look at the second object only, which a box protects."""
     turned = ring(10).viewmats.clone()
@@ -109,6 +111,7 @@ def test_cameras_see_protected_rows_too(two_objects, tmp_path):
     assert (report.kept_count, report.output_count) == (3000, 3150)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [None, ring(10)])
 def test_images_that_show_nothing_are_a_warning_as_in_one_piece(scene, tmp_path, given):
     faint = scene.with_tensors({"logit_opacities": torch.full((len(scene),), -9.0)})
@@ -162,6 +165,7 @@ def test_blocks_have_more_cells_where_images_err_only_with_given_cameras(scene, 
     assert errors["given", 1.0] < 0.97 * errors["given", 0.0]
 
 
+@pytest.mark.slow
 def test_cells_of_all_blocks_are_allocated_again_by_errors(scene, tmp_path):
     """Also faint Gaussians that the sort leaves are in a cell again."""
     logits = torch.where(torch.arange(len(scene)) % 2 == 0, -3.0, scene.logit_opacities)
@@ -184,6 +188,7 @@ def test_cells_of_all_blocks_are_allocated_again_by_errors(scene, tmp_path):
     assert sum(counts) == job.read_manifest().grouped < len(scene)
 
 
+@pytest.mark.slow
 def test_masses_in_costs_are_scaled_by_the_factor_of_the_earlier_cell(scene, tmp_path):
     config = SimplifyConfig.from_mapping(MATCHED)
     job = unfinished_job(scene, tmp_path, count=150, blocks=BLOCKS, config=config, cameras=ring(10))
@@ -198,6 +203,7 @@ def test_masses_in_costs_are_scaled_by_the_factor_of_the_earlier_cell(scene, tmp
     assert moved > 0  # cells cross borders
 
 
+@pytest.mark.slow
 def test_blocks_share_the_count_again_by_errors_as_in_one_piece(scene, tmp_path, monkeypatch):
     """Of two equal objects in all images, images err more in one, which is a block."""
 
@@ -222,6 +228,7 @@ def test_blocks_share_the_count_again_by_errors_as_in_one_piece(scene, tmp_path,
     assert abs(counts[1] - int((one.means[:, 1] > 2).sum())) <= 8
 
 
+@pytest.mark.slow
 def test_cells_that_images_do_not_show_keep_their_masses(scene, tmp_path, monkeypatch):
     observe = images.observe
 
@@ -239,6 +246,7 @@ def test_cells_that_images_do_not_show_keep_their_masses(scene, tmp_path, monkey
         assert files[0] == files[1]
 
 
+@pytest.mark.slow
 def test_blocks_that_keep_all_gaussians_keep_their_cells(source, scene, tmp_path):
     simplifier = Simplifier(config=SimplifyConfig.from_mapping(MATCHED), device="cpu")
     path, cameras = tmp_path / "out.ply", ring(10)
@@ -309,6 +317,7 @@ def test_a_block_that_no_camera_shows_stays_as_it_is(two_objects, tmp_path):
     assert not bool(same[~is_second].all())
 
 
+@pytest.mark.slow
 def test_blocks_use_only_the_cameras_that_show_them(two_objects, tmp_path, monkeypatch):
     """Half of the cameras look at the second object; more than enough for both blocks."""
     below = ring(10).viewmats.clone()
@@ -337,6 +346,7 @@ def test_two_workers_and_cameras_give_the_same_bits(source, tmp_path):
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
+@pytest.mark.slow
 def test_cameras_are_part_of_the_key_of_a_job(scene, tmp_path):
     config = SimplifyConfig.from_mapping(MATCHED)
     job = unfinished_job(scene, tmp_path, count=150, blocks=BLOCKS, config=config, cameras=ring(6))

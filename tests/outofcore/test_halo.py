@@ -155,6 +155,7 @@ def test_a_halo_reaches_as_far_as_the_last_own_neighbour(place, cells_found):
     assert halo_cells(centers, others, count=1).tolist() == cells_found
 
 
+@pytest.mark.slow
 def test_points_weigh_as_in_one_piece(job):
     config, parts = job.config.cvt, []
     for block in job.blocks_with_rows():
@@ -305,6 +306,7 @@ def test_axes_and_inflation_are_the_same_as_in_one_piece(job):
     assert same_bits(inflated, wanted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["job", "tagged_job"])
 def test_the_network_corrects_as_in_one_piece(which, request):
     job = request.getfixturevalue(which)

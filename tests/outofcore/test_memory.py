@@ -270,6 +270,7 @@ def test_blocks_need_the_least_memory(tmp_path: Path) -> None:
             simplify_file(tmp_path / "a.ply", tmp_path / "b.ply", 0.1, memory=wrong, blocks=2)
 
 
+@pytest.mark.slow
 def test_formats_that_are_written_from_memory_say_what_they_need(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -322,6 +323,7 @@ def test_too_small_a_disk_is_said_before_the_work(tmp_path, monkeypatch, room):
         assert "blocks take some 9.2 MB, but 9.2 MB of the disk are free; write the" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rho", "degree", "blocks"), [(0.5, 0, 4), (0.02, 0, 4), (0.9, 3, 4), (0.004, 3, 16)]
 )

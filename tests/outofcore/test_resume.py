@@ -294,6 +294,7 @@ def shortened(source):
     os.truncate(source, source.stat().st_size // 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "found"),
     [(replaced, "it changed; start again"), (shortened, "it shorter"), (Path.unlink, "no such f")],
@@ -326,6 +327,7 @@ def test_an_interrupt_before_all_rows_are_sorted_leaves_no_folder(source, tmp_pa
     assert [path.name for path in tmp_path.iterdir()] == ["in.ply"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "run",
     [
@@ -375,6 +377,7 @@ def test_a_run_continues_with_its_blocks_if_the_memory_is_enough(
     assert not (tmp_path / ".out.ply.blocks").exists()
 
 
+@pytest.mark.slow
 def test_blocks_that_were_asked_for_are_used(source, tmp_path):
     output = tmp_path / "out.ply"
     with pytest.raises(StoppedError):
@@ -382,6 +385,7 @@ def test_blocks_that_were_asked_for_are_used(source, tmp_path):
     assert simplify_file(source, output, 0.05, blocks=4).resumed_blocks == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", [b"", b"{}", b'{"blocks": 8}'])
 def test_a_run_without_readable_sizes_is_not_continued_by_another_memory(
     source, tmp_path, monkeypatch, damage

@@ -255,6 +255,7 @@ def test_huge_gaussians_have_finite_units(log_scale):
     assert all(tensor.isfinite().all() for tensor in optimizer.scene().tensors().values())
 
 
+@pytest.mark.slow
 def test_seeds_and_steps_are_whole_numbers_of_any_type():
     full = full_scene()
     small = discolored(full)

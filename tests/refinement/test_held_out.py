@@ -54,6 +54,7 @@ def test_thinned_views_start_at_every_first_pixel_in_turn():
     assert shifts == [(0, 0), (-0.5, 0), (0, -0.5), (-0.5, -0.5), (0, 0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "side"), [(16, 22), (24, 24), (32, 32), (200, 32)])
 def test_images_are_of_two_sizes(width, side):
     """About half are as sharp as larger ones, which steps then see fewer pixels of."""

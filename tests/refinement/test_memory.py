@@ -13,6 +13,7 @@ from refine_cases import discolored, full_scene, quick, ring
 from scenes import same_bits
 
 
+@pytest.mark.slow
 def test_auto_refines_on_the_cpu_if_a_device_lacks_memory() -> None:
     full = full_scene(200)
     small, options = discolored(full), {"cameras": ring(4), "config": quick()}
@@ -25,6 +26,7 @@ def test_auto_refines_on_the_cpu_if_a_device_lacks_memory() -> None:
     assert found.report.steps == 3
 
 
+@pytest.mark.slow
 def test_steps_of_a_failed_attempt_do_not_count(monkeypatch) -> None:
     full, step = full_scene(200), optimize.optimize
 

@@ -97,6 +97,7 @@ def test_generated_views_are_endless_and_differ_from_held_out_ones():
     assert {(camera.width, camera.height) for camera in training} == {(32, 32)}
 
 
+@pytest.mark.slow
 def test_the_seed_decides_the_views():
     full = full_scene()
     first, again, other = (
@@ -221,6 +222,7 @@ def test_the_pixels_of_a_step_equal_those_of_the_whole_image():
     assert len(seen) == 9
 
 
+@pytest.mark.slow
 def test_held_out_views_are_thinned_like_training_images():
     full = full_scene(50)
     views = generated_views(full, config=quick(size=48, stride=2), seed=0)

@@ -69,6 +69,7 @@ def test_count_degree_layout_comments_and_extras_stay():
     torch.testing.assert_close(lengths, torch.ones(len(small)))
 
 
+@pytest.mark.slow
 def test_the_input_scenes_are_not_changed():
     full = full_scene()
     small = small_scene(full)
@@ -237,6 +238,7 @@ def test_a_single_existing_image_is_not_used():
     assert same_bits(found.scene, refine(discolored(full), full, **options).scene)
 
 
+@pytest.mark.slow
 def test_images_and_cameras_may_be_on_other_devices_than_the_scene():
     full = full_scene(20, degree=0)
     observed = cvtgs.rendering.observe(full, ring(9))

@@ -119,6 +119,7 @@ def test_images_that_are_too_small_for_ssim_are_not_thinned():
     assert images.draw().rgb.shape == (1, 21, 40, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("steps", "found"), [(None, 12), (3, 3)])
 def test_only_configured_steps_are_multiplied(steps, found):
     full = full_scene(60)

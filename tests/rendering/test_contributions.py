@@ -63,6 +63,7 @@ def test_contributions_ignore_colours_and_sum_to_the_alpha_of_images(backend):
     assert float(found.sum()) == pytest.approx(float(alpha.sum()), rel=1e-9)
 
 
+@pytest.mark.slow
 @backends
 def test_shares_of_errors_are_weighted_like_the_colours_of_an_image(backend):
     """Relative to the mean error of each image; a channel below 0, drawn as 0, does not matter."""
@@ -86,6 +87,7 @@ def test_shares_of_errors_are_weighted_like_the_colours_of_an_image(backend):
         error_shares(scene, cameras)
 
 
+@pytest.mark.slow
 @backends
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
 def test_errors_are_shared_out_in_modes_without_gradients(backend, mode):
@@ -195,6 +197,7 @@ def test_images_that_show_nothing_change_nothing():
     assert torch.equal(measured.apparent_areas, estimated.apparent_areas)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "is_hidden"), [(1.0, False), (0.1, False), (3e-3, True)])
 def test_a_scene_too_small_for_the_near_plane_is_warned_about(scale, is_hidden):
     scene = move(demo_scene(1000, seed=1), Motion(scale=scale))
@@ -303,6 +306,7 @@ def test_colours_and_images_of_other_sizes_are_refused(backend):
             weights.collect(wrong)
 
 
+@pytest.mark.slow
 @backends
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_weights_take_colours_and_images_of_any_dtype(backend, dtype):

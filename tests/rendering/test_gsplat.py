@@ -238,6 +238,7 @@ def test_images_and_contributions_in_one_pass(install, mode, degree):
         )
 
 
+@pytest.mark.slow
 def test_views_are_chosen_by_gsplat_as_on_the_host(install):
     positions = find_view_positions(synthetic.scene("object", 150, sh_degree=0, seed=0))
     wanted = mixed_views(positions, 4, size=64)

@@ -68,6 +68,7 @@ def test_the_count_is_the_ceiling_of_the_decimal_as_written(total):
         assert target_count(total, float(f"{hundredths / 100:.2f}")) == wanted
 
 
+@pytest.mark.slow
 @each_preset
 @pytest.mark.parametrize("total", [1, 2, 3, 5, 100, 101])
 def test_exact_count_by_ratio(total, preset, subtests):

@@ -286,6 +286,7 @@ def test_a_prepared_scene_runs_again_on_a_device():
             assert same_bits(small.to("cpu"), wanted.run(count=count).scene)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["draft", "standard"])
 @one_thread()
 def test_two_gaussians_on_a_device(preset):

@@ -39,6 +39,7 @@ def matched(power: float, *, rounds: int = 1, **steps: int) -> Simplifier:
     return Simplifier(config=config, device="cpu")
 
 
+@pytest.mark.slow
 def test_cells_merge_less_where_the_given_cameras_see_errors():
     once, twice = (
         matched(power).run(full(), count=COUNT, cameras=given_cameras()) for power in (0.0, 1.0)
@@ -63,6 +64,7 @@ def test_errors_count_without_a_match_of_opacities():
     assert twice.report.stages[-1].stage == "errors"
 
 
+@pytest.mark.slow
 def test_errors_in_generated_views_do_not_count():
     found = [matched(power).simplify(full(), count=COUNT) for power in (0.0, 1.0)]
     assert same(*found)
@@ -78,6 +80,7 @@ def test_a_scene_that_stays_whole_and_a_preset_without_images_are_not_affected()
     assert same(plain, Simplifier(device="cpu").simplify(full(), count=COUNT))
 
 
+@pytest.mark.slow
 def test_levels_and_repeated_runs_have_the_bits_of_single_runs():
     wanted = matched(1.0).simplify(full(), count=COUNT, cameras=given_cameras())
     prepared = matched(1.0).prepare(full(), cameras=given_cameras())

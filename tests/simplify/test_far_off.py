@@ -40,6 +40,7 @@ def moved_to(small: GaussianScene, shift: torch.Tensor) -> GaussianScene:
     return small.with_tensors(means=small.means + shift)
 
 
+@pytest.mark.slow
 def test_a_far_scene_is_as_good_as_at_the_origin(near, far):
     """Merged positions are rounded to steps of 1/64, once; both have these positions."""
     small, report = Simplifier(device="cpu").run(far, 0.1)
@@ -50,6 +51,7 @@ def test_a_far_scene_is_as_good_as_at_the_origin(near, far):
     assert kept >= report.single_member_cells > 0
 
 
+@pytest.mark.slow
 def test_blocks_of_a_far_scene(near, far, tmp_path):
     cvtgs.save(far, tmp_path / "far.ply")
     cvtgs.save(near, tmp_path / "near.ply")
@@ -79,6 +81,7 @@ def test_only_coarse_positions_are_centred(distance, dtype, moves):
         assert torch.equal((means - origin) + origin, means)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [30.0, 1e4])
 def test_groups_far_apart_are_seen_from_near(near, distance):
     """With the extent of the whole as that of a view, the network lost 4 to 7 dB."""
@@ -92,6 +95,7 @@ def test_groups_far_apart_are_seen_from_near(near, distance):
     assert psnr(near, corrected) > alone - 1.5
 
 
+@pytest.mark.slow
 def test_groups_far_apart_in_blocks(near, tmp_path):
     both = cvtgs.concatenate([near, moved_to(near, torch.tensor([1e3, 0.0, 0.0]))])
     cvtgs.save(both, tmp_path / "both.ply")
@@ -100,6 +104,7 @@ def test_groups_far_apart_in_blocks(near, tmp_path):
     assert psnr(near, cvtgs.load(tmp_path / "small.ply")) > psnr(near, whole) - 0.3
 
 
+@pytest.mark.slow
 def test_far_landscapes_are_contracted_about_their_centre():
     near = cvtgs.synthetic.scene("landscape", 6000, sh_degree=0, seed=1)
     near = near.with_tensors(means=(near.means * 64).round() / 64)

@@ -76,6 +76,7 @@ def dominated_scene(heavy: int, total: int, degree: int) -> GaussianScene:
     return scene.with_tensors(tensors, {})
 
 
+@pytest.mark.slow
 @each_preset
 @pytest.mark.parametrize("rho", [0.5, 0.1, 0.01])
 def test_the_order_of_rows_does_not_matter(preset, rho):
@@ -94,6 +95,7 @@ def test_the_order_of_rows_does_not_matter_in_float32():
     )
 
 
+@pytest.mark.slow
 @each_preset
 @pytest.mark.parametrize("scale", [1e-3, 0.5, 7.0, 1e3])
 def test_the_unit_of_length_does_not_matter(preset, scale):
@@ -114,6 +116,7 @@ def test_a_shift_does_not_matter(preset, shift):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize(
     "quat",
@@ -129,6 +132,7 @@ def test_turns_that_keep_the_axes(quat, degree, ckpt):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quat", [(0.9, 0.1, -0.3, 0.2), (0.1, 0.7, 0.2, -0.6)])
 @pytest.mark.parametrize("rho", [RATIO, 0.1], ids=["from a tessellation", "from Gaussians"])
 def test_any_turn_where_nothing_depends_on_the_axes(rho, quat, ckpt):

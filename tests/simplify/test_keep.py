@@ -122,6 +122,7 @@ def test_refinement_leaves_unused_bands_at_zero():
     assert not bool(small.shN[30:, 3:].any())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stride", [1, 2])
 def test_refinement_is_told_what_to_keep_and_reuses_only_images_of_its_kind(
     scene, monkeypatch, stride

@@ -175,6 +175,7 @@ def test_seeds(setting):
     assert all(map(torch.equal, found, wanted))
 
 
+@pytest.mark.slow
 @settings
 def test_positions_above_a_floor(setting):
     scene = make("courtyard", 500, sh_degree=0, seed=1)
@@ -185,6 +186,7 @@ def test_positions_above_a_floor(setting):
     assert torch.equal(found.eyes, wanted.eyes)
 
 
+@pytest.mark.slow
 @backends
 @settings
 def test_contributions(scene, setting, backend):
@@ -208,6 +210,7 @@ def test_axes_first_used_in_inference_mode_work_with_gradients(scene):
         torch.testing.assert_close(leaf.grad, 2 * scene.shN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("work", [simplify, simplify_by_images])
 def test_scenes_that_require_gradients(scene, work):
     leaves = {name: values.clone().requires_grad_() for name, values in scene.tensors().items()}

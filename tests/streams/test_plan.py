@@ -60,6 +60,7 @@ def test_a_gaussian_is_in_the_chunk_of_the_coarse_one_with_most_of_its_rows(owne
     assert [0 in own[0].tolist() for own in rows] == [chunk == 0, chunk == 1]
 
 
+@pytest.mark.slow
 def test_any_number_of_threads_plans_the_same_chunks(two_threads):
     """Each fine Gaussian replaces three rows, two of them of one coarse Gaussian."""
     some, others = torch.randint(200, (2, 200_000), generator=torch.Generator().manual_seed(0))

@@ -35,6 +35,7 @@ def test_a_new_stream_is_published_by_a_move_that_waits_on_windows(
     assert moved == [tmp_path / "out"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_moved", [False, True])
 @pytest.mark.parametrize("number", range(7))
 def test_an_interrupted_replacement_keeps_the_old_stream(

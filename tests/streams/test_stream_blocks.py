@@ -97,6 +97,7 @@ def test_every_level_has_the_mass_of_a_run_in_one_piece(tmp_path: Path) -> None:
         assert math.isclose(mass, float(level.scene.masses.sum()), rel_tol=0.08)
 
 
+@pytest.mark.slow
 def test_parts_of_3d_tiles_share_a_root_without_content(tmp_path: Path, source: Path) -> None:
     report = stream(source, tmp_path / "out", kind="3dtiles")
     document = json.loads((tmp_path / "out" / "tileset.json").read_text())
@@ -346,6 +347,7 @@ def test_blocks_are_kept_if_the_last_step_is_interrupted(
     assert stream(source, out).resumed_blocks == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blocks", [None, 3])
 def test_all_files_are_in_a_mounted_folder(
     tmp_path: Path, source: Path, scene: GaussianScene, blocks: int | None, monkeypatch: Any

@@ -151,6 +151,7 @@ def test_boxes_enclose_flyaways_where_files_hold_them(blocks: int | None, tmp_pa
     assert document["geometricError"] < 20_000
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
 @pytest.mark.parametrize("blocks", [None, 2])
 def test_tiles_of_an_object_have_smaller_errors_than_those_of_a_sky(

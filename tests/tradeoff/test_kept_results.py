@@ -50,6 +50,7 @@ def measure(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("failing", [KeyboardInterrupt(), RunError("it failed"), None])
 def test_an_interrupt_leaves_the_results_that_the_old_page_describes(
     tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch, failing: BaseException | None

@@ -78,6 +78,7 @@ def mapped_file(tensor: torch.Tensor) -> str:
     return ""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="needs Linux")
 def test_cases_take_no_memory(source, tmp_path):
     """All large tensors stay in the file, or hundreds of cases would fill the memory."""

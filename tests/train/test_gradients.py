@@ -51,6 +51,7 @@ def test_the_cases_of_a_step_differ_and_are_the_same_every_time(scenes, cache):
     assert len({one.loss for one in results + results_of(config, cache, step=4)}) == 8
 
 
+@pytest.mark.slow
 def test_the_first_case_of_a_step_does_not_depend_on_their_number(scenes, cache):
     one, two = (results_of(config_of(scenes, cases_per_step=count), cache) for count in (1, 2))
     assert one[0].loss == two[0].loss
@@ -70,6 +71,7 @@ def test_processes_compute_what_one_does(scenes, cache, monkeypatch):
             torch.testing.assert_close(others, some, rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_step_follows_the_mean_gradient(scenes, cache, tmp_path, monkeypatch):
     config = config_of(scenes, cases_per_step=2, steps=1)
     seen: list[torch.Tensor] = []

@@ -115,6 +115,7 @@ def test_the_same_training_gives_the_same_bytes(scenes, cache, tmp_path):
         assert contents[0] == contents[1]
 
 
+@pytest.mark.slow
 def test_the_random_state_of_torch_is_kept(scenes, cache, tmp_path):
     torch.manual_seed(5)
     wanted = torch.rand(3)
@@ -318,6 +319,7 @@ def test_without_matplotlib_there_is_a_network_and_no_image(scenes, cache, tmp_p
     assert not (tmp_path / "net.png").exists()
 
 
+@pytest.mark.slow
 def test_scenes_may_have_double_precision(tmp_path):
     for number, name in enumerate(("exam", "lesson")):
         scene = small_scene(400 + number)

@@ -128,6 +128,7 @@ def test_the_network_is_given_sizes_in_pixels_of_the_images(size):
     assert float(distances.amax()) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("tagged", "share"), [(True, 0.5), (False, 0.25)])
 def test_half_of_the_images_of_a_tagged_scene_ignore_the_tag(tagged, share, monkeypatch):
     """Of the four images of this scene, one ignores it."""
@@ -149,6 +150,7 @@ def test_half_of_the_images_of_a_tagged_scene_ignore_the_tag(tagged, share, monk
     assert sum(seen) / len(seen) == pytest.approx(share, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [1, 40, 200])
 def test_chunks_of_the_network_change_neither_loss_nor_gradient(length, monkeypatch):
     case, views, config = some_case(), some_views(), config_of(residual_weight=1.0)

@@ -258,6 +258,7 @@ def test_large_scenes_are_thinned_and_look_the_same(monkeypatch):
     assert abs(thinned.radius / whole.radius - 1) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [500, 800, 1200])
 def test_small_objects_are_no_rooms(count):
     for seed in range(3):
@@ -267,6 +268,7 @@ def test_small_objects_are_no_rooms(count):
     assert find_layout(room).room is not None
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_scenes_that_require_gradients_and_any_seeds():
     scene = random_scene(50)
@@ -282,6 +284,7 @@ def test_scenes_that_require_gradients_and_any_seeds():
     assert not torch.equal(*minus)
 
 
+@pytest.mark.slow
 def test_numbers_of_numpy_are_accepted():
     scene = random_scene(50)
     count, seed = np.int64(8), np.int64(2)
@@ -298,6 +301,7 @@ def test_random_views_need_a_whole_number_of_views(count):
         random_views(random_scene(50), count, size=32, seed=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reach", [(1,), 1, None, (3, 1), (-1, 0), (0, math.nan), ("a", 2)])
 def test_random_views_need_a_range_of_distances(reach):
     with pytest.raises(InvalidArgumentError, match="two ascending numbers of at least 0, found"):

@@ -53,6 +53,7 @@ def test_positions_behind_floaters_are_cluttered():
     assert float(clear[:, 2].amax()) < 0 < float(cluttered[:, 2].amin())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("heights", "floaters"), [((-2.5, 2.5), 0), ((-2.5, -2.0, -3.0, 2.5), 60)])
 def test_without_much_clutter_all_positions_stay(heights, floaters):
     """Without floaters, or where a quarter of all positions is behind them."""
@@ -76,6 +77,7 @@ def test_an_outdoor_place_without_clutter_keeps_its_positions():
     assert len(find_view_positions(scene).cluttered) == 0
 
 
+@pytest.mark.slow
 def test_no_position_is_nearer_to_a_cluttered_one_than_to_a_clear_one():
     layout = find_layout(wall(0))
     radius = layout.frame.radius

@@ -114,6 +114,7 @@ def test_a_preset_that_renders_uses_and_reports_the_cameras(tmp_path, scene, cap
     assert "5 cameras found in" in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.slow
 def test_a_search_for_a_count_uses_the_cameras_beside_a_file(tmp_path, scene):
     cvtgs.save(scene, tmp_path / "scene.ply")
     cameras = automatic_views(scene, 8, width=32, height=24)
@@ -178,6 +179,7 @@ def test_damaged_cameras_cause_one_warning(tmp_path: Path, scene: cvtgs.Gaussian
     assert len(caught) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "is_found"), [(1.0, True), (0.5, True), (6.0, False)])
 def test_cameras_of_another_scale_are_not_used(
     tmp_path: Path, scene: cvtgs.GaussianScene, factor: float, is_found: bool

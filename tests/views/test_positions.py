@@ -61,6 +61,7 @@ def sphere(count: int, radius: float = 1.0) -> Tensor:
     return radius * torch.nn.functional.normalize(points, dim=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["courtyard", "landscape"])
 @pytest.mark.parametrize("floor", [True, False])
 def test_people_in_an_open_place_stand_on_its_ground(kind, floor, monkeypatch):
@@ -179,6 +180,7 @@ def test_a_room_open_to_a_side_is_viewed_from_there_or_from_inside(convention, m
     assert all(bool(is_behind(cameras).any()) for cameras in views())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["object", "courtyard", "landscape", "haze", "thin", "room"])
 def test_other_scenes_are_no_rooms_that_are_open_to_a_side(kind):
     for seed in range(2):
@@ -255,6 +257,7 @@ def test_splats_are_measured_without_autocast(monkeypatch):
         assert bool(splat_sizes(layout, cameras).in_image.isfinite().all())
 
 
+@pytest.mark.slow
 def test_every_fourth_gaussian_shows_nearly_the_same_sizes(monkeypatch):
     scene = cvtgs.synthetic.scene("object", 24_000, sh_degree=0, seed=1)
     layout, cameras = find_layout(scene), automatic_views(scene, 6, width=64, height=64)
