@@ -354,12 +354,12 @@ def test_a_finished_run_that_is_interrupted_is_not_offered_to_be_continued(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("first", "second", "continues"),
-    [(0, 0, True), (0, 1, True), (0, 50, True), (0, 600, True), (50, 0, False), (600, 50, False)],
+    [(0, 0, True), (0, 1, True), (0, 50, True), (0, 600, True), (50, 0, False), (600, 30, False)],
 )
 def test_a_run_continues_with_its_blocks_if_the_memory_is_enough(
     source, tmp_path, monkeypatch, first, second, continues
 ):
-    """The memory is in MB, above the least; with less than 600, the sample is smaller, too."""
+    """The memory is in MB, above the least; with less than 40, the sample is smaller, too."""
 
     def count(rows, memory, *, merging=0):
         return 8 if memory < LEAST_BYTES + 20_000_000 else 4
