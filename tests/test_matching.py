@@ -54,7 +54,7 @@ def views(scene):
     return observe(scene, mixed_views(scene, 10, size=48))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_least_squares_recover_known_colours(degree):
     """Images of a scene determine the colours of Gaussians that they show enough of."""

@@ -149,7 +149,7 @@ def test_consoles_with_other_encodings_work(tmp_path: Path, encoding: str) -> No
     assert b"Traceback" not in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @linux
 def test_file_names_that_are_not_utf_8_work(tmp_path: Path) -> None:
     path = os.fsencode(tmp_path) + b"/sc\xe9ne.ply"

@@ -116,7 +116,7 @@ def test_seams_where_nearly_all_is_kept(monkeypatch, capsys):
     assert capsys.readouterr().out.splitlines()[-1].endswith("| inf (1.0000) | +0.00 (+0.0000) |")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_streams_in_blocks_are_compared_with_one_piece(monkeypatch, capsys):
     words = ["large", "seams", "--stream", "--exact", "--kinds", "object", "--count", "1500"]
     words += ["--blocks", "1,3", "--presets", "draft", "--rho", "0.2"]

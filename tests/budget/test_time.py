@@ -273,7 +273,7 @@ def test_the_best_preset_that_fits_is_chosen(model):
     assert choose_preset(work, 1e9, model=model).preset == CANDIDATES[-1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("count", [4, 50, 1000])
 def test_few_given_cameras_cost_fewer_images(model, count):
     """Of 50 cameras, ``matched`` renders 32; ``high`` would render 72."""

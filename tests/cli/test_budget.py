@@ -218,7 +218,7 @@ def test_a_budget_shorter_than_start_up_is_refused(scene, monkeypatch):
         choose_preset(options("--count", "10", "--time-budget", "5s"), scene, {}, silent)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_target_is_searched_and_reported(source, capsys, shown):
     report = source.with_name("report.json")
     small = simplified(source, "--target-psnr", "15", "--report", str(report))
@@ -381,7 +381,7 @@ def test_a_target_is_measured_on_the_file_over_the_heldout_views(
     assert (given["written"](scene) is not scene) == is_read_back
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("words", [["--sh-degree", "0"], ["--effects", "sh=0"]])
 def test_bands_that_are_dropped_count_in_the_quality_to_reach(tmp_path, capsys, words):
     full, small = tmp_path / "in.ply", tmp_path / "out.ply"

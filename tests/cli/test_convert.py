@@ -211,7 +211,7 @@ def test_a_version_of_spz_needs_an_spz(tmp_path: Path, capsys: pytest.CaptureFix
     assert not (tmp_path / "a.glb").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("words", [["--sh-degree", "0"], ["--effects", "sh=0"], []])
 def test_a_searched_scene_has_the_columns_of_a_given_count(
     tmp_path: Path, words: list[str]

@@ -107,7 +107,7 @@ def test_a_large_scene_is_streamed_in_blocks(
     assert document["root"]["transform"][12:15] == pytest.approx((4276e3, 639e3, 4672e3), abs=2e3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_suffix_of_a_scene_in_blocks_may_be_in_capitals(
     tmp_path: Path, words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -172,7 +172,7 @@ def test_cameras_beside_the_scene_are_read_only_if_levels_use_images(
     assert capsys.readouterr().err.count("cameras are not used") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_levels_fitted_to_cameras_that_score_are_mentioned(tmp_path, capsys):
     save(random_scene(200), tmp_path / "a.ply")
     pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
@@ -269,7 +269,7 @@ def test_a_page_shows_a_scene_that_is_named_like_a_level(tmp_path, monkeypatch):
     assert {name: len(one) for name, one in shown.items()} == {str(path): 30, "rho_0.5.ply": 15}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("axes", [[], ["--axes", "rdf"], ["--axes", "rub"]])
 def test_turned_scenes_are_not_scored_from_cameras_beside_them(
     tmp_path: Path, words: list[str], axes: list[str], capsys: pytest.CaptureFixture[str]

@@ -185,7 +185,7 @@ def test_each_call_builds_a_new_parser():
     assert build_parser() is not build_parser()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_a_signal_leaves_no_output_behind(tmp_path, name):
     number = getattr(signal, name)
@@ -240,7 +240,7 @@ def buffering(request, monkeypatch):
         monkeypatch.setenv("PYTHONUNBUFFERED", "1")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @full_disk
 @pytest.mark.usefixtures("buffering")
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ def views(case: str) -> Cameras:
     return replace(cameras, viewmats=viewmats)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("blocks", [1, 3])
 @pytest.mark.parametrize("case", [FAR, NEAR, BLIND])
 def test_refinement_does_not_repeat_what_the_run_has_warned_of(scene, tmp_path, case, blocks):

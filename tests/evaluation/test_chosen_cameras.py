@@ -25,7 +25,7 @@ def small(scene):
     return {"small": cvtgs.simplify(scene, 0.05, preset="fast")}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("score", [evaluate, compare])
 def test_a_scene_in_memory_is_scored_from_automatic_views(scene, small, score):
     found, wanted = (

@@ -179,7 +179,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_closed_terminal_leaves_the_end_of_workers_to_their_parent(tmp_path):
     program = tmp_path / "program.py"
     program.write_text(HANGUP)

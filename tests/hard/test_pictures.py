@@ -79,7 +79,7 @@ def scores(scene, small, cameras):
 
 
 @near_plane
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "dtype", [torch.float32, pytest.param(torch.float64, marks=pytest.mark.long)], ids=["32", "64"]
 )

@@ -59,7 +59,7 @@ def test_plyfile_is_imported_only_for_unusual_files(tmp_path: Path) -> None:
     assert printed(program, common, odd) == ["[]", "[]", "['plyfile']"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_scene_in_memory_imports_no_format() -> None:
     program = (
         "import sys, cvtgs\n"

@@ -55,7 +55,7 @@ def stopped_in(source, output, stage, nth):
     return next(output.parent.glob(".out.ply.blocks/*"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("stage", "nth"), [("errors", 1), ("allocate", 2), ("merge", 2), ("blocks", 2), ("images", 1)]
 )
@@ -76,7 +76,7 @@ def test_a_run_continues_in_the_second_allocation(source, whole, tmp_path, stage
     assert not folder.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "kind",
     [

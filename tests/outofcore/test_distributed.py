@@ -198,7 +198,7 @@ def test_a_worker_that_joins_later_with_another_version_is_refused():
         distributed._call(abs, {"cvtgs": "0.0.1"}, -3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore")
 def test_errors_of_workers_are_reported_in_one_sentence(cluster, source):
     from distributed import Client  # noqa: PLC0415 (optional)

@@ -151,7 +151,7 @@ def test_what_is_near_a_block_reaches_half_of_its_diagonal_beyond_it():
     assert near.tolist() == [True, True, True, False, False, False]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("settings", [MATCHED, REFINED])
 def test_blocks_use_the_views_of_one_piece_if_they_are_fine_enough(
     source, scene, tmp_path, monkeypatch, settings
@@ -275,7 +275,7 @@ def test_refinement_in_blocks_gains_and_keeps_protected_gaussians(scene, source,
     assert all(torch.equal(a, kept.tensors()[name]) for name, a in first.tensors().items())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["small", "improved", "targets"])
 def test_reports_are_whole_after_damage_to_files_of_finished_blocks(source, tmp_path, kind):
     def stop(event):

@@ -323,7 +323,7 @@ def test_too_small_a_disk_is_said_before_the_work(tmp_path, monkeypatch, room):
         assert "blocks take some 9.2 MB, but 9.2 MB of the disk are free; write the" in text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("rho", "degree", "blocks"), [(0.5, 0, 4), (0.02, 0, 4), (0.9, 3, 4), (0.004, 3, 16)]
 )

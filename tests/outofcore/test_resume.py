@@ -351,7 +351,7 @@ def test_a_finished_run_that_is_interrupted_is_not_offered_to_be_continued(
     assert not can_continue(output)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("first", "second", "continues"),
     [(0, 0, True), (0, 1, True), (0, 50, True), (0, 600, True), (50, 0, False), (600, 30, False)],
@@ -385,7 +385,7 @@ def test_blocks_that_were_asked_for_are_used(source, tmp_path):
     assert simplify_file(source, output, 0.05, blocks=4).resumed_blocks == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("damage", [b"", b"{}", b'{"blocks": 8}'])
 def test_a_run_without_readable_sizes_is_not_continued_by_another_memory(
     source, tmp_path, monkeypatch, damage

@@ -51,7 +51,7 @@ def paired(job, scene):
     return rows
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("boxes", "comments"), [((), ()), ((BOX,), ()), ((), ("SplatRenderMode: mip",))]
 )

@@ -134,7 +134,7 @@ def test_a_single_gaussian():
     assert refined.report.gain >= 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [kind for kind in cvtgs.synthetic.KINDS if kind != "object"])
 def test_other_kinds_of_scenes(kind):
     full = cvtgs.synthetic.scene(kind, 800, sh_degree=0, seed=1)

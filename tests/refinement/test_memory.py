@@ -26,7 +26,7 @@ def test_auto_refines_on_the_cpu_if_a_device_lacks_memory() -> None:
     assert found.report.steps == 3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_steps_of_a_failed_attempt_do_not_count(monkeypatch) -> None:
     full, step = full_scene(200), optimize.optimize
 
@@ -65,7 +65,7 @@ def test_a_full_host_is_one_sentence(monkeypatch) -> None:
         refine(discolored(full), full, steps=1, device="cpu", config=quick())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_refinement_of_a_simplifier_takes_the_whole_run_to_the_cpu(monkeypatch) -> None:
     """The steps alone do not fit; the report says where everything was computed."""
     config = SimplifyConfig.from_mapping({"refine": {"steps": 2, "size": 32, "heldout": 2}})

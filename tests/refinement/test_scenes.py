@@ -38,7 +38,7 @@ def test_wrong_colours_are_corrected():
     assert after < before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_simplified_scene_improves_on_unseen_views():
     full = full_scene(2000, degree=0)
     small = small_scene(full, 0.02)

@@ -126,7 +126,7 @@ def test_threads_of_torch_and_numba_stay_as_they_are(monkeypatch):
     assert lines == ["1 1", "2 2", "3 2", "3 2"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_threads_can_render_at_the_same_time_without_openmp():
     """As on machines without its library (libgomp1, absent in slim images of Docker)."""
     pytest.importorskip("numba")

@@ -114,7 +114,7 @@ def test_a_report_says_how_to_repeat_the_run(preset):
     assert same_bits(again.simplify(scene, 0.1), small)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_paths_are_accepted_wherever_scenes_are(tmp_path):
     scene, path = random_scene(300), tmp_path / "scene.ply"
     scene.save(path)

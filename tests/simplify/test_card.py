@@ -44,7 +44,7 @@ def assert_looks_like(found: cvtgs.GaussianScene, wanted: cvtgs.GaussianScene) -
     assert min(scores.psnr.views) > 35.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("preset", ["draft", "fast", "standard", "paper"])
 def test_presets_look_the_same_as_on_the_cpu(preset):
     scene = made()

@@ -51,7 +51,7 @@ def test_a_far_scene_is_as_good_as_at_the_origin(near, far):
     assert kept >= report.single_member_cells > 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_blocks_of_a_far_scene(near, far, tmp_path):
     cvtgs.save(far, tmp_path / "far.ply")
     cvtgs.save(near, tmp_path / "near.ply")
@@ -81,7 +81,7 @@ def test_only_coarse_positions_are_centred(distance, dtype, moves):
         assert torch.equal((means - origin) + origin, means)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("distance", [30.0, 1e4])
 def test_groups_far_apart_are_seen_from_near(near, distance):
     """With the extent of the whole as that of a view, the network lost 4 to 7 dB."""

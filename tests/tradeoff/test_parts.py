@@ -364,14 +364,14 @@ def test_the_page_has_plot_table_and_slider(page):
 
 
 @needs_browser
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page_fits_a_phone(page):
     """The wide table scrolls in its own container."""
     assert layout_on_a_phone(page) == "390/390 390"
 
 
 @needs_browser
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_large_screen_shows_all_columns(measured, tmp_path):
     names = ("plan", "visibility", "weigh", "tessellate", "allocate", "merge", "network", "refine")
     runs = (result("high", 9.0, 31.0, stages=dict.fromkeys(names, 12.5)), MADE[0])

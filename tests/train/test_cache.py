@@ -171,7 +171,7 @@ def test_a_ratio_that_leaves_nothing_to_merge_has_no_cases(tmp_path):
     ],
     ids=["seed", "preset", "ratios", "count", "sizes", "nothing that matters"],
 )
-@pytest.mark.slow
+@pytest.mark.long
 def test_only_results_affected_by_a_change_are_recomputed(
     source, made, tmp_path, changes, images, cases
 ):
@@ -205,7 +205,7 @@ DAMAGE = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
 def test_a_damaged_file_is_recomputed(source, made, tmp_path, damage):
     first = prepare_scene(source, config_of(), tmp_path)

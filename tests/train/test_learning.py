@@ -60,7 +60,7 @@ def trained(request, tmp_path_factory) -> Trained:
     return Trained(config, history, TrainFiles.beside(name))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_unseen_scene_gains(trained):
     start, *later = trained.history.validations
     assert start.gains == (Gain("exam", 0.06, 0.0),)
@@ -132,7 +132,7 @@ def test_the_checkpoint_records_how_to_reproduce_it(trained):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_second_training_names_the_first(trained, tmp_path):
     """It discards the known range of the first: only its own training cases count."""
     folders = (write_scenes(tmp_path / "other", ["exam", "lesson"]),)

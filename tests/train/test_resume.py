@@ -88,7 +88,7 @@ def test_a_run_interrupted_anywhere_can_be_resumed(scenes, cache, tmp_path, kind
 
 @pytest.mark.usefixtures("_quick_curves")
 @pytest.mark.parametrize(("where", "count"), [("validation_psnr", 2), ("write_atomically", 3)])
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_interrupted_during_validation_can_be_resumed(
     scenes, cache, tmp_path, monkeypatch, where, count
 ):

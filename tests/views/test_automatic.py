@@ -62,7 +62,7 @@ def ups(cameras: cvtgs.Cameras) -> Tensor:
     return -cameras.viewmats[:, 1, :3].float()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("turn", TURNS)
 def test_views_of_every_kind(kind, turn):
@@ -92,7 +92,7 @@ def test_only_rooms_are_viewed_from_inside(kind):
     assert (distances < layout.radius).all() == (kind == "room")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_flyaways_hardly_change_the_views(kind):
     scene = generated(kind)
@@ -208,7 +208,7 @@ def test_infinite_opacities_and_bad_rows_do_no_harm():
     ],
     ids=["automatic", "random", "mixed"],
 )
-@pytest.mark.slow
+@pytest.mark.long
 def test_views_of_a_georeferenced_scene_are_those_of_the_scene_at_the_origin(dtype, choose):
     """At 6e6 float32 resolves steps of 0.5; the scene spans a kilometre and is rounded to them."""
     scene = generated("object", 2000)

@@ -180,7 +180,7 @@ def test_a_room_open_to_a_side_is_viewed_from_there_or_from_inside(convention, m
     assert all(bool(is_behind(cameras).any()) for cameras in views())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["object", "courtyard", "landscape", "haze", "thin", "room"])
 def test_other_scenes_are_no_rooms_that_are_open_to_a_side(kind):
     for seed in range(2):
