@@ -358,4 +358,4 @@ def assert_estimate(tmp_path, monkeypatch, *, rho, degree, blocks, **options):
         "cvtgs.outofcore.folders.warn_of_full_disk", lambda _, needed: estimates.append(needed)
     )
     simplify_file(source, folder / "b.ply", rho, blocks=blocks, listener=measure, **options)
-    assert 0.75 * estimates[0] < max(used) < 0.97 * estimates[0]
+    assert 0.8 * estimates[0] < max(used) < 0.97 * estimates[0]

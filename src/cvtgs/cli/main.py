@@ -140,7 +140,7 @@ def _without_empty_folder(options: argparse.Namespace) -> Iterator[None]:
     except BaseException:
         with suppress(OSError):
             for path in new:
-                os.rmdir(os.path.realpath(path))  # noqa: PTH106 (of a link, what it leads to)
+                Path(os.path.realpath(path)).rmdir()  # of a link, what it leads to
         raise
 
 

@@ -159,10 +159,7 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, overwrite:
 def make_folder(folder: str | os.PathLike[str]) -> None:
     """Create a folder to write to, unless it exists; symbolic links are followed."""
     try:
-        try:
-            Path(folder).mkdir(parents=True, exist_ok=True)
-        except FileExistsError:  # a link to a folder that does not exist, or a file
-            Path(os.path.realpath(folder)).mkdir(parents=True, exist_ok=True)
+        Path(os.path.realpath(folder)).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(
             f"{os.fspath(folder)}: must be a folder or a new path, found: {reason_of(error)}."
