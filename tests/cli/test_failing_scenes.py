@@ -122,7 +122,7 @@ def test_a_report_that_fails_too_does_not_replace_the_first_error(
     damaged, report, last = capsys.readouterr().err.splitlines()
     assert damaged == "cvtgs: error: [2/3] b.ply: damaged."
     assert report.startswith("cvtgs: warning: report.json: the output must not exist yet")
-    assert report.endswith("; the scenes in out were written, the report was not.")
+    assert report.endswith("; 2 of 3 scenes in out were written, the report was not.")
     assert last == "cvtgs: error: 1 of 3 scenes failed; 2 are in out."
 
 

@@ -177,7 +177,7 @@ def _print_score_table(
         row = [scene.name, f"{scene.count:,}", size, f"{scene.psnr.mean:.2f}"]
         row += [f"{scene.ssim.mean:.4f}", f"{lpips.mean:.4f}" if lpips else "-"]
         if scene.alpha_error and scene.alpha_bias:
-            row += [f"{scene.alpha_error.mean:.4f}", f"{scene.alpha_bias.mean:+.4f}"]
+            row += [f"{scene.alpha_error.mean:.4f}", f"{scene.alpha_bias.mean:+z.4f}"]
         rows.append(row)
     say_table(rows)
 

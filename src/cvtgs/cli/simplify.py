@@ -181,7 +181,9 @@ def simplify(options: argparse.Namespace) -> None:
         def write_entries() -> None:
             if entries:
                 text = json.dumps(entries, indent=2) + "\n"
-                _write_report(options, text, f"the scenes in {options.folder} were")
+                done = sum(entry["error"] is None for entry in entries)
+                scenes = f"{done} of {len(entries)} scenes in {options.folder}"
+                _write_report(options, text, f"{scenes} were")
 
         try:
             run_jobs(jobs, work, failed=lambda job, error: keep(job, error=str(error)))

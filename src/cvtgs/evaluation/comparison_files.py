@@ -135,7 +135,7 @@ def error_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
             lines = [
                 "Alpha minus that of the full scene",
                 f"error {scores.alpha_error.mean:.4f}",
-                f"bias {scores.alpha_bias.mean:+.4f}",
+                f"bias {scores.alpha_bias.mean:+z.4f}",
             ]
             views = scores.alpha_error.views
             captions = [f"error {views[view]:.4f}" for view in comparison.shown]
@@ -159,7 +159,7 @@ def _small_row(comparison: Comparison, scores: SceneScores, images: Images) -> _
         f"SSIM {scores.ssim.mean:.3f}",
         f"LPIPS {scores.lpips.mean:.3f}" if scores.lpips else "",
         f"alpha error {scores.alpha_error.mean:.4f}" if scores.alpha_error else "",
-        f"alpha bias {scores.alpha_bias.mean:+.4f}" if scores.alpha_bias else "",
+        f"alpha bias {scores.alpha_bias.mean:+z.4f}" if scores.alpha_bias else "",
     ]
     captions = [_psnr_text(scores.psnr.views[view]) for view in comparison.shown]
     return _Row(scores.name, lines, images, captions)

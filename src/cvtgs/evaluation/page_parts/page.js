@@ -6,7 +6,7 @@
   const at = (id) => document.getElementById(id);
   const stage = at("stage");
 
-  const number = (value, digits) => value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });
+  const number = (value, digits, signDisplay = "auto") => value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits, signDisplay });
   const count = (value) => number(value, 0);
   const decibels = (value) => (Number.isFinite(Number(value)) ? number(Number(value), 2) + " dB" : "equal");
   const meanDecibels = ({ mean, views }) => {
@@ -49,7 +49,7 @@
     ["SSIM", (scene) => scene.ssim, (value) => number(Number(value), 3)],
     ["LPIPS", (scene) => scene.lpips, (value) => number(Number(value), 3)],
     ["Alpha error", (scene) => scene.alpha_error, (value) => number(Number(value), 4)],
-    ["Alpha bias", (scene) => scene.alpha_bias, (value) => (Number(value) > 0 ? "+" : "") + number(Number(value), 4)],
+    ["Alpha bias", (scene) => scene.alpha_bias, (value) => number(Number(value), 4, "exceptZero")],
   ].filter(([, of]) => data.small.every((scene) => of(scene)));
 
   const maps = [
