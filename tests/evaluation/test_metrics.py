@@ -21,7 +21,7 @@ from cvtgs.evaluation import (
     psnr,
     ssim,
 )
-from cvtgs.evaluation.blind_views import check_seen, check_two_see
+from cvtgs.evaluation.blind_views import check_seen
 from cvtgs.losses import ssim_loss
 from cvtgs.scene import GaussianScene
 from cvtgs.views import automatic_views
@@ -230,10 +230,10 @@ def test_cameras_most_of_which_see_nothing_are_a_warning(blind: int) -> None:
     expected = pytest.warns(UserWarning, match=r"^2 of 3 cameras see nothing of it; give cameras")
     with expected if blind == 2 else nullcontext():
         check_seen(scene, cameras, name="it")
-    check_seen(scene, cameras, name="it", is_sample=True)
+    check_seen(scene, cameras, name="it", parts=[])
 
 
-def test_all_parts_are_read_until_a_second_camera_sees_a_gaussian() -> None:
+def test_parts_are_read_until_enough_cameras_see_a_gaussian() -> None:
     """The second camera looks away from the sample, at the second part."""
     intrinsics = torch.tensor([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]]).expand(2, 3, 3)
     poses = torch.stack([torch.eye(4), torch.diag(torch.tensor([-1.0, 1, -1, 1]))])
@@ -247,10 +247,19 @@ def test_all_parts_are_read_until_a_second_camera_sees_a_gaussian() -> None:
             read.append(scene)
             yield scene
 
-    check_two_see(front, parts(front, back, front), cameras, name="it")
+    def check(views: Cameras, *scenes: GaussianScene, refines: bool = True) -> None:
+        check_seen(front, views, name="it", parts=parts(*scenes), refines=refines)
+
+    check(cameras, front, back, front)
+    assert read == [front, back]
+    check(cameras, back, refines=False)
     assert read == [front, back]
     with pytest.raises(InvalidArgumentError, match=r"2 cameras that see it, .* found 1 of 2"):
-        check_two_see(front, parts(front), cameras, name="it")
+        check(cameras, front)
+    check(cameras.select([1]), front, back, front, refines=False)
+    assert read == [front, back, front, front, back]
+    with pytest.raises(InvalidArgumentError, match="must see it, found nothing of it in any of 1"):
+        check(cameras.select([1]), front, refines=False)
 
 
 def test_cameras_that_see_a_few_gaussians_of_many_are_not_blind() -> None:

@@ -25,12 +25,14 @@ def check_seen(
     *,
     name: str,
     backend: BackendName = "auto",
-    is_sample: bool = False,
+    parts: Iterable[GaussianScene] | None = None,
     refines: bool = False,
 ) -> None:
     """Raise if too few cameras see anything of a scene, or one is no pinhole camera.
 
-    Warn if few see anything, which a sample of a scene cannot tell, or the near plane hides much.
+    Warn if few see anything, or the near plane hides much. If parts are given, the scene is a
+    sample of them, which cannot tell how many cameras see something; parts are read only as long
+    as too few see the sample.
     """
     if len(scene) == 0:
         raise InvalidSceneError(f"{name} must have at least one Gaussian, found none.")
@@ -43,44 +45,42 @@ def check_seen(
             f"background; give cameras of this scene, in its units.",
             CameraWarning,
         )
-    empty = _count_blind(scene, cameras, enough=2 if refines else 1, backend=backend)
+    enough = 2 if refines else 1
+    if parts is None:
+        empty = _count_blind(scene, cameras, enough=enough, backend=backend)
+    else:
+        empty = _count_blind_in_parts(scene, parts, cameras, enough=enough)
     if empty == len(cameras):
         raise InvalidArgumentError(
             f"the cameras must see {name}, found nothing of it in any of {len(cameras)} "
             f"views; give cameras of this scene, in its axes and units."
         )
-    if refines and empty == len(cameras) - 1 and not is_sample:
-        raise _seen_by_one(len(cameras), name)
-    if not is_sample:
+    if refines and empty == len(cameras) - 1:
+        raise InvalidArgumentError(
+            f"a refinement needs at least 2 cameras that see {name}, one of them to be held out; "
+            f"found 1 of {len(cameras)}."
+        )
+    if parts is None:
         _warn_of_blind(empty, len(cameras), name)
 
 
-def check_two_see(
-    sample: GaussianScene, parts: Iterable[GaussianScene], cameras: Cameras, *, name: str
-) -> None:
-    """Raise if fewer than two cameras see anything of a scene; in doubt, its parts are read."""
-    blind = _missing(_drawn(sample), cameras.singles())
-    if len(cameras) - len(blind) < 2:
+def _count_blind_in_parts(
+    sample: GaussianScene, parts: Iterable[GaussianScene], cameras: Cameras, *, enough: int
+) -> int:
+    """Count cameras that see nothing of a sample, nor of parts, which are read while few see."""
+    blind, most = _missing(_drawn(sample), cameras.singles()), len(cameras) - enough
+    if len(blind) > most:
         blind = [camera for camera in blind if _is_empty(sample, camera)]
     rest = iter(parts)
-    while len(cameras) - len(blind) < 2:
-        part = next(rest, None)
-        if part is None:
-            raise _seen_by_one(len(cameras), name)
+    while len(blind) > most and (part := next(rest, None)) is not None:
         blind = _missing(_drawn(part), blind)
+    return len(blind)
 
 
 def _missing(points: Float[Tensor, "n 3"], cameras: Sequence[Cameras]) -> list[Cameras]:
     """Return the cameras with none of the points in their images."""
     exact = points.double()
     return [camera for camera in cameras if not camera.shows_any(exact)]
-
-
-def _seen_by_one(count: int, name: str) -> InvalidArgumentError:
-    return InvalidArgumentError(
-        f"a refinement needs at least 2 cameras that see {name}, one of them to be held out; "
-        f"found 1 of {count}."
-    )
 
 
 def warn_of_blind(scene: GaussianScene, cameras: Cameras, *, name: str) -> None:

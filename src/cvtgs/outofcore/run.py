@@ -16,7 +16,7 @@ from cvtgs.counts import checked_whole, shared_out, shortfall, target_count, who
 from cvtgs.devices import HOST, full_precision, on_host, one_thread
 from cvtgs.edit import concatenate
 from cvtgs.errors import ConfigError, check_path, warn
-from cvtgs.evaluation.blind_views import check_seen, check_two_see
+from cvtgs.evaluation.blind_views import check_seen
 from cvtgs.grouping import most_cells
 from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES, checked_axes
@@ -206,9 +206,7 @@ def _cameras_to_fit(
         return None
     sample = read_sample(rows, SAMPLED)
     if given is not None:
-        check_seen(sample, given, name="the scene", is_sample=True)
-        if refines:
-            check_two_see(sample, read_chunks(rows), given, name="the scene")
+        check_seen(sample, given, name="the scene", parts=read_chunks(rows), refines=refines)
         return given
     own = find_own_cameras(sample, source)
     if own is None:
