@@ -329,7 +329,7 @@ def test_other_presets_work_in_blocks(source, tmp_path, preset):
 
 
 @pytest.mark.parametrize(
-    ("text", "wanted"), [("4GB", 4 * 10**9), ("2 GiB", 2**31), ("600mb", 6 * 10**8)]
+    ("text", "wanted"), [("4GB", 4 * 10**9), ("2 GiB", 2**31), ("700mb", 7 * 10**8)]
 )
 def test_amounts_of_memory_are_parsed(text, wanted):
     assert read_bytes(text) == wanted
