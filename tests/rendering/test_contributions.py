@@ -63,7 +63,6 @@ def test_contributions_ignore_colours_and_sum_to_the_alpha_of_images(backend):
     assert float(found.sum()) == pytest.approx(float(alpha.sum()), rel=1e-9)
 
 
-@pytest.mark.slow
 @backends
 def test_shares_of_errors_are_weighted_like_the_colours_of_an_image(backend):
     """Relative to the mean error of each image; a channel below 0, drawn as 0, does not matter."""

@@ -25,11 +25,16 @@ from scenes import random_scene
 # Against the oracle
 
 
+SLOW = pytest.mark.slow
+double_or_slow = pytest.mark.parametrize(
+    "dtype", [torch.float64, pytest.param(torch.float32, marks=SLOW)]
+)
+
+
 @backends
-@dtypes
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@double_or_slow
+@pytest.mark.parametrize("degree", [*(pytest.param(n, marks=SLOW) for n in (0, 1, 2)), 3])
 @pytest.mark.parametrize("comments", [(), MIP], ids=["plain", "mip"])
-@pytest.mark.slow
 def test_random_scenes(backend, dtype, degree, comments):
     scene = random_scene(25, seed=degree, degree=degree, dtype=dtype, size=0.2)
     scene = replace(scene, comments=comments)
@@ -57,10 +62,11 @@ HARD = {
 
 
 @backends
-@dtypes
+@double_or_slow
 @pytest.mark.parametrize("row", HARD.values(), ids=HARD)
-@pytest.mark.parametrize("comments", [(), MIP], ids=["plain", "mip"])
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    "comments", [pytest.param((), id="plain"), pytest.param(MIP, id="mip", marks=SLOW)]
+)
 def test_hard_gaussians(backend, dtype, row, comments):
     behind = ((0, 0, 8.0), (0.8, 1.5, 1.0), 0.6, (0, 0, 1.0))
     scene = scene_of(row, behind, dtype=dtype, comments=comments)
