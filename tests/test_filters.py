@@ -158,6 +158,15 @@ def test_standard_rows_stay_bit_for_bit():
     assert torch.equal(once.means, scene.means)
 
 
+def test_quaternions_are_of_unit_length_if_its_square_is_within_a_hundred_thousandth():
+    quats = torch.nn.functional.normalize(random_scene(3).quats.double(), dim=1)
+    squares = torch.tensor([0.8e-5, 1.2e-5, 0.5]).double().add(1)
+    given = random_scene(3, dtype=torch.float64).with_tensors(quats=quats * squares.sqrt()[:, None])
+    found = standardized(given).quats
+    assert torch.equal(found[0], given.quats[0])
+    torch.testing.assert_close(found[1:], quats[1:], rtol=0.0, atol=1e-12)
+
+
 def test_standard_rows_have_opacities_strictly_between_0_and_1():
     scene = random_scene(3)
     logits = torch.tensor([INF, -700.0, 2.0])
@@ -315,3 +324,14 @@ def test_positions_beyond_float32_count_as_infinite() -> None:
     far = scene.with_tensors({"means": means}, {})
     assert invalid_rows(far)["means"].tolist() == [False, True, False]
     assert writable_rows(far).tolist() == [True, False, True]
+
+
+def test_of_those_that_images_cannot_show_the_heaviest_come_back():
+    keep = visible_rows(
+        torch.tensor([0.001, 0.001, 0.001, 0.9]),
+        torch.tensor([1.0, 3.0, 2.0, 9.0]),
+        min_opacity=0.1,
+        max_mass_share=1.0,
+        at_least=2,
+    )
+    assert keep.tolist() == [False, True, False, True]

@@ -284,8 +284,9 @@ def test_duplicates_of_rounded_positions_are_found(step, count, dtype):
 
 
 def test_zeros_of_both_signs_are_one_position():
-    means = torch.tensor([[0.0, 1, 2], [-0.0, 1, 2]])
-    assert float(duplicate_share(means, torch.zeros(2, 1, 3))) == 0.5
+    means = random_scene(50).means * torch.tensor([0.0, 1, 1])
+    both = torch.cat([means, means * torch.tensor([-1.0, 1, 1])])  # sampled in the order of hashes
+    assert float(duplicate_share(both, torch.zeros(100, 1, 3))) == 0.5
 
 
 def test_duplicates_have_one_colour():
@@ -351,7 +352,7 @@ def test_a_plan_is_frozen():
 
 
 def test_gaussians_that_images_cannot_show_are_not_drawn():
-    assert drawn_rows(torch.tensor([0.001, 0.5])).tolist() == [False, True]
+    assert drawn_rows(torch.tensor([0.001, 1 / 255, 0.5])).tolist() == [False, True, True]
     assert drawn_rows(torch.tensor([0.001, 0.002])).tolist() == [True, True]  # a scene needs some
 
 

@@ -8,6 +8,7 @@ import torch
 
 import cvtgs
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
+from cvtgs.analysis import plan_effects, restore_columns
 from cvtgs.cli.main import main
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.ply import assemble
@@ -163,6 +164,15 @@ def test_surfels_stay_surfels():
     assert bool((flat.scene.log_scales[:, 2] == FLAT_LOG_SCALE).all())
     assert float(thick.scene.log_scales[:, 2].median()) > FLAT_LOG_SCALE / 2
     assert flat.scene.log_scales[:, :2].equal(thick.scene.log_scales[:, :2])
+
+
+def test_flattening_leaves_the_given_scene_as_it_is():
+    full, small = surfels(20), random_scene(10)
+    plan = plan_effects(full, full.masses, distances=torch.ones(20))
+    before = small.log_scales.clone()
+    found = restore_columns(small, full, plan)
+    assert found.log_scales[:, 2].tolist() == [FLAT_LOG_SCALE] * 10
+    assert torch.equal(small.log_scales, before)
 
 
 def test_surfels_are_written_without_a_third_scale(tmp_path):

@@ -137,3 +137,9 @@ def test_enclosed_and_far_gaussians_count_less() -> None:
     assert found.tolist() == [8.0, 2.0, 5.0, 0.5]
     config = TessellationConfig(hidden_share=1.0, perspective=False)
     assert apparent_areas(areas, distances, seen[:0], config=config).tolist() == [8.0] * 4
+
+
+def test_a_mass_beyond_whole_numbers_only_blocks_its_direction():
+    means = torch.tensor([[0.01, 0.01, 0.01], [0.05, 0.01, 0.01]]).double()
+    found = ambient_visibility(means, torch.tensor([0.0, 1e300]).double(), UNIT)
+    assert found.tolist() == pytest.approx([5 / 6, 1.0])

@@ -6,7 +6,7 @@ import torch
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig, load, save, synthetic
 from cvtgs.cells import Partition, merge_cells
 from cvtgs.config import MergeConfig
-from cvtgs.math.spherical_harmonics import SH_C0, evaluate
+from cvtgs.math.spherical_harmonics import SH_C0, clamped_parts, evaluate
 from cvtgs.outofcore import simplify_file
 from scenes import random_scene, same_bits
 
@@ -113,3 +113,19 @@ def test_the_plan_decides_for_all_runs():
     before, after = (each.simplify(dark, 0.02).sh0 for each in (plain, raised))
     assert (after >= before - 1e-6).all()
     assert after.mean() > before.mean() + 0.05
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_bands_are_raised_by_the_mean_of_what_is_below_zero_less_that_of_the_mean(degree):
+    scene = random_scene(40, degree=degree, dtype=torch.float64)
+    scene = scene.with_tensors(  # all weigh the same
+        sh0=scene.sh0 - 0.3 / SH_C0,
+        log_scales=torch.zeros_like(scene.log_scales),
+        logit_opacities=torch.zeros_like(scene.logit_opacities),
+    )
+    cells = Partition.from_labels(torch.zeros(40, dtype=torch.int64), 1)
+    plain, raised = (merged(scene, cells, clamping=clamping) for clamping in (False, True))
+    wanted = clamped_parts(scene.sh0, scene.shN).mean(dim=0)
+    wanted = wanted - clamped_parts(plain.sh0, plain.shN)[0]
+    torch.testing.assert_close((raised.sh - plain.sh)[0], wanted)
+    assert bool((wanted.abs().amax(dim=1) > 1e-3).all())

@@ -132,3 +132,19 @@ def test_blocks_keep_as_many_as_one_piece(walled: GaussianScene, tmp_path: Path)
     one = far_count(walled, Simplifier().simplify(walled, 0.1))
     simplify_file(tmp_path / "full.ply", tmp_path / "small.ply", 0.1, blocks=3)
     assert far_count(walled, load(tmp_path / "small.ply")) == pytest.approx(one, rel=0.1)
+
+
+def test_masses_at_the_distance_of_viewers_by_hand(monkeypatch: pytest.MonkeyPatch):
+    """The gain of 9 sets in from 2.5 to 3 radii, and a heavy pair is one of a third of all."""
+    names = merge_pairs.__wrapped__.__globals__
+    costs, seen = names["_pair_costs"], []
+
+    def record(table, first, second, config, heavy):
+        seen.append((table[2].tolist(), heavy))
+        return costs(table, first, second, config, heavy)
+
+    monkeypatch.setitem(names, "_pair_costs", record)
+    means = torch.tensor([[0.0, 2.75, 3.25, 9.0], [0.0] * 4, [0.0] * 4])
+    config = AllocationConfig(heaviest=1.0, far_gain=9.0)
+    merge_pairs(groups_at(1.0)._replace(means=means), NEAR, 3, config, area=1e9)
+    assert seen == [(pytest.approx([1.0, 3.0, 9.0, 9.0]), pytest.approx((20.0 / 3.0, 1.0)))]

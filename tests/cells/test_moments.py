@@ -238,3 +238,19 @@ def test_colours_of_moments_are_from_black_to_one_and_a_half():
     ones = torch.ones(2)
     found = gaussian_moments(scene, torch.arange(2), frame, masses=ones, apparent_masses=ones)
     assert found.colors.T.tolist() == [[0.0] * 3, [1.5] * 3]
+
+
+def test_masses_are_in_units_of_their_mean_and_above_zero():
+    """A group of members without mass still has a mean of these."""
+    scene, frame = random_scene(3), RobustFrame(center=torch.zeros(3).double(), radius=1.0)
+    masses = torch.tensor([0.0, 2.0, 4.0])
+    found = gaussian_moments(scene, torch.arange(3), frame, masses=masses, apparent_masses=masses)
+    assert found.masses.tolist() == [1e-12, 1.0, 2.0]
+    assert found.apparent_masses.tolist() == [0.0, 1.0, 2.0]
+
+
+def test_what_lies_on_one_another_is_opaque_to_99_percent_at_most():
+    three = random_scene(1, dtype=torch.float64).select(torch.tensor([0, 0, 0]))
+    three = three.with_tensors(logit_opacities=torch.full((3,), 9.0).double())
+    cells = Partition.from_labels(torch.zeros(3, dtype=torch.int64), 1)
+    assert merged(three, cells, RULES["standard"]).opacities.tolist() == pytest.approx([0.99])

@@ -69,6 +69,15 @@ def test_a_heavy_member_is_always_taken():
     assert min(light) == pytest.approx(MOST_SAMPLED / 1398)
 
 
+def test_each_cell_is_sampled_for_itself():
+    masses = torch.ones(200)
+    masses[0] = 50.0
+    one = sample_members(scene_of_masses(masses), cells_of([200])).part.order.tolist()
+    two = sample_members(scene_of_masses(masses.repeat(2)), cells_of([200, 200])).part.order
+    assert one[0] == 0
+    assert two.tolist() == [*one, *(200 + row for row in one)]
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_sums_are_estimated(seed):
     """Masses exactly but for members of more than a step; other sums within a hundredth."""

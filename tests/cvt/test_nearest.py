@@ -9,7 +9,7 @@ import torch
 import oracles
 from cvtgs.cvt import nearest_neighbors, nearest_scipy, nearest_site
 from cvtgs.cvt.device_search import nearest_in_tiles
-from cvtgs.cvt.nearest import nearest_several
+from cvtgs.cvt.nearest import nearest_several, runs_of_equal, search_once_per_position
 from cvtgs.errors import InvalidArgumentError
 
 
@@ -221,3 +221,36 @@ def test_neighbours_exist_where_squares_of_distances_overflow():
     found = nearest_neighbors(sites, 2)
     assert found.shape == (4, 2)
     assert set(found.flatten().tolist()) <= {0, 1, 2, 3}
+
+
+@dtypes
+def test_runs_of_equal_points_are_searched_once(dtype, monkeypatch):
+    searched = []
+    monkeypatch.setattr(
+        "cvtgs.cvt.nearest.nearest_site",
+        lambda points, sites: searched.append(points.tolist()) or nearest_site(points, sites),
+    )
+    points = torch.tensor([[0, 0], [0, 0], [0, 3], [0, 3], [4, 3], [0, 0]], dtype=dtype)
+    sites = torch.tensor([[2, 0], [0, 5]], dtype=dtype)
+    labels, squared = search_once_per_position(points, sites)
+    assert searched == [[[0, 0], [0, 3], [4, 3], [0, 0]]]
+    assert labels.tolist() == [0, 0, 1, 1, 0, 0]
+    assert squared.tolist() == pytest.approx([4, 4, 4, 4, 13, 4])
+
+
+@dtypes
+def test_points_are_searched_in_chunks(dtype, monkeypatch):
+    monkeypatch.setattr("cvtgs.cvt.nearest.CHUNK", 4)
+    points = torch.arange(10, dtype=dtype)[:, None]
+    labels, squared = nearest_site(points + 0.25, points.flip(0))
+    assert labels.tolist() == list(range(9, -1, -1))
+    assert squared.tolist() == [0.0625] * 10
+
+
+def test_equal_sites_are_numbered_in_their_order():
+    order, ranks = runs_of_equal(torch.tensor([[1.0, 2], [0, 5], [1, 2], [7, 0], [1, 2], [0, 5]]))
+    assert order.tolist()[:3] == [0, 2, 4]
+    assert dict(zip(order.tolist(), ranks.tolist(), strict=True)) == {
+        0: 0, 1: 0, 2: 1, 3: 0, 4: 2, 5: 1
+    }  # fmt: skip
+    assert runs_of_equal(torch.tensor([[1.0, 2], [2, 1]])) is None
