@@ -12,7 +12,9 @@ from cvtgs.matching import (
     heldout_rows,
     heldout_views,
     linear_view,
+    match_opacities,
     match_views,
+    mean_squared_error,
     with_deeper_opacities,
 )
 from cvtgs.rendering import observe, render
@@ -76,3 +78,22 @@ def test_view_dependent_colors_far_from_the_origin_are_those_of_renders() -> Non
     image = render(scene, camera).rgb[0]
     assert float(image.amax()) > 0.1
     assert float(linear_view(scene, camera, image).residual.abs().amax()) < 1e-4
+
+
+def test_frozen_gaussians_keep_their_colours_and_the_others_make_up_for_them() -> None:
+    scene = random_scene(40, degree=1, size=0.3)
+    views = observe(scene, ring(3))
+    gray = scene.with_tensors(sh0=torch.zeros_like(scene.sh0))
+    found = fit_colors(gray, views, config=MatchConfig(color_iterations=4), frozen=20)
+    assert same_bits(found[:20], gray[:20])
+    assert bool((found.sh0[20:] != gray.sh0[20:]).any())
+    errors = [mean_squared_error(one, views) for one in (gray, found)]
+    assert errors[1] < 0.8 * errors[0]
+
+
+def test_frozen_gaussians_keep_their_opacities() -> None:
+    scene, cameras = random_scene(40, degree=0, size=0.3), ring(2)
+    config = MatchConfig(opacity_rounds=1)
+    found = match_opacities(scene, cameras, torch.full((40,), 5.0), config=config, frozen=20)
+    assert same_bits(found[:20], scene[:20])
+    assert bool((found.logit_opacities[20:] != scene.logit_opacities[20:]).all())

@@ -92,7 +92,7 @@ def test_a_file_of_version_1_made_by_hand_is_read(tmp_path: Path) -> None:
         "s": [[255, 0, 255, 255], [0, 255, 0, 255]],
         "q": [[128, 128, 128, 253], [1, 2, 3, 7]],  # half a turn about x; no rotation
         "c": [[255, 0, 0, 255], [0, 255, 0, 0]],
-        "i": [[1, 0, 0, 255], [0, 0, 0, 255]],
+        "i": [[1, 0, 0, 255], [64, 0, 0, 255]],  # of 64 colours, so the second has none
     }
     for name, rows in files.items():
         (tmp_path / f"{name}.webp").write_bytes(image(rows))
@@ -104,7 +104,7 @@ def test_a_file_of_version_1_made_by_hand_is_read(tmp_path: Path) -> None:
     torch.testing.assert_close(scene.log_scales, torch.tensor([[0.0, -4, 0], [-5, 0, -3]]))
     assert scene.logit_opacities.tolist() == [4, -4]
     assert scene.sh0[:, 0].tolist() == [[1, -1, -1], [-1, 1, -1]]
-    assert scene.shN.tolist() == [[[2, -2, -2]] * 3, [[-2, -2, -2]] * 3]
+    assert scene.shN.tolist() == [[[2, -2, -2]] * 3, [[0, 0, 0]] * 3]
     half_turn = torch.tensor([[0.0, 1, 0, 0], [1, 0, 0, 0]])
     torch.testing.assert_close(scene.quats, half_turn, rtol=0, atol=3e-3)
 

@@ -40,7 +40,7 @@ def test_a_row_made_by_hand_is_read(tmp_path: Path) -> None:
 def test_the_written_bytes_are_as_computed_by_hand(tmp_path: Path) -> None:
     scene = GaussianScene(
         means=torch.tensor([[1.0, 2.0, 3.0]]),
-        quats=torch.tensor([[0.0, 5.0, 0.0, 0.0]]),
+        quats=torch.tensor([[0.0, -3.0, 0.0, 4.0]]),  # 128 - 0.6 * 128 = 51.2
         log_scales=torch.tensor([[0.0, 0.0, 0.0]]),
         logit_opacities=torch.tensor([float("inf")]),
         sh0=torch.zeros(1, 1, 3),
@@ -48,7 +48,7 @@ def test_the_written_bytes_are_as_computed_by_hand(tmp_path: Path) -> None:
     )
     save(scene, tmp_path / "a.splat")
     assert (tmp_path / "a.splat").read_bytes() == struct.pack(
-        "<6f8B", 1, 2, 3, 1, 1, 1, 128, 128, 128, 255, 128, 255, 128, 128
+        "<6f8B", 1, 2, 3, 1, 1, 1, 128, 128, 128, 255, 128, 51, 128, 230
     )
 
 

@@ -14,6 +14,7 @@ from cvtgs.math.spherical_harmonics import (
     degree_of,
     evaluate,
     rest_basis,
+    rotated_rest,
 )
 
 
@@ -73,6 +74,8 @@ def test_rotated_coefficients_give_the_colours_of_turned_directions(degree):
     torch.testing.assert_close(
         evaluate(turned[:, :1], turned[:, 1:], turned_directions), seen, rtol=0, atol=1e-6
     )
+    found = rotated_rest(plain[:, 1:], torch.from_numpy(matrix))
+    torch.testing.assert_close(found, turned[:, 1:], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("count", [1, 14, 24, -1])

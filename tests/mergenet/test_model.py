@@ -361,3 +361,13 @@ def test_neighbours_turn_a_cell_by_twice_their_mean_pull():
     x, y, z = (seen.pair_positions / (1 + seen.pair_positions.abs())).unbind(2)
     mean = torch.stack([y * z, x * z, x * y], dim=2).mean(dim=1)
     torch.testing.assert_close(found, 0.5 * torch.tanh(2 * 0.5 * math.tanh(1.0) * mean))
+
+
+def test_a_copy_of_another_precision_leaves_the_network_as_it_is():
+    net = lively_net(torch.float32)
+    before = {name: values.clone() for name, values in net.state_dict().items()}
+    copied = net.copy_to(torch.device("cpu"), torch.float64)
+    assert {values.dtype for values in copied.state_dict().values()} == {torch.float64}
+    for name, values in net.state_dict().items():
+        assert values.dtype == torch.float32
+        assert torch.equal(values, before[name])

@@ -1,12 +1,18 @@
 """The filter in blocks leaves out the Gaussians that it leaves out in one piece."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
 import cvtgs
 from cvtgs import GaussianScene, Simplifier
+from cvtgs.analysis import perspective_falloff
+from cvtgs.analysis.analyze import HALF_GRID
 from cvtgs.boxes import Box, inside
-from cvtgs.outofcore import run, simplify_file
+from cvtgs.config import TessellationConfig
+from cvtgs.math.frames import RobustFrame
+from cvtgs.outofcore import run, simplify_file, sort
 from scenes import random_scene
 
 COUNT, OPAQUE = 3000, 300
@@ -54,6 +60,24 @@ def test_the_faintest_of_a_haze_are_left_out_up_to_its_share(scene, tmp_path) ->
     assert whole.plan.haze.active
     assert report.filtered_count == whole.filtered_count
     assert 10 < whole.filtered_count < 100
+
+
+@pytest.mark.parametrize(("heaviest", "stays"), [(1, [0]), (2, [0, 1]), (None, [0, 1, 2])])
+def test_flyaways_up_to_the_largest_mass_to_leave_out_are_left_out(heaviest, stays) -> None:
+    """They have the same mass at 200 and 300 radii, but that at 200 shows more."""
+    frame = RobustFrame(center=torch.zeros(3).double(), radius=1.0)
+    three = random_scene(1, degree=0).select(torch.zeros(3, dtype=torch.int64))
+    three = three.with_tensors(means=torch.diag(torch.tensor([1.0, 200.0, 300.0])))
+    seen = three.areas * three.opacities * perspective_falloff(frame.distances(three.means))
+    scan = SimpleNamespace(
+        visibility=torch.ones((2 * HALF_GRID) ** 3 + 1),
+        frame=frame,
+        min_opacity=0.0,
+        min_faint_mass=0.0,
+        max_flyaway_mass=-1.0 if heaviest is None else float(seen[heaviest]),
+    )
+    left, *_ = vars(sort)["_filtered"](scan, TessellationConfig(), three, torch.arange(3))
+    assert left.tolist() == stays
 
 
 @pytest.mark.slow

@@ -45,6 +45,18 @@ def test_steps_of_a_failed_attempt_do_not_count(monkeypatch) -> None:
     assert (found.report.steps, found.report.gain > 0) == (8, True)
 
 
+def test_a_second_attempt_takes_all_steps_again(monkeypatch) -> None:
+    monkeypatch.setattr(
+        import_module("cvtgs.refinement.refine"),
+        "within_memory",
+        lambda compute, place, **_: [compute(place, note) for note in ("", "again")][1],
+    )
+    full = full_scene(50)
+    options = {"cameras": ring(4), "config": quick(), "device": "cpu"}
+    report = refine(discolored(full), full, steps=1, **options).report
+    assert (report.device_note, report.steps, report.images > 0) == ("again", 1, True)
+
+
 def test_a_named_device_is_not_left() -> None:
     full = full_scene(200)
     with pretended_cuda(largest=1000), pytest.raises(OutOfMemoryError) as caught:

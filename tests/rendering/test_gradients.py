@@ -9,7 +9,7 @@ import cvtgs.synthetic
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.rendering import contributions, projection, render
-from render_cases import BACKENDS, MIP, backends
+from render_cases import BACKENDS, MIP, backends, scene_of, straight
 from scenes import random_scene
 
 
@@ -209,3 +209,15 @@ def test_unused_bands_have_gradients_of_zero(backend, degree):
     image = render(scene.with_tensors(shN=bands), TWO, backend=backend, sh_degree=0).rgb
     (found,) = torch.autograd.grad(image.sum(), bands)
     assert torch.equal(found, torch.zeros_like(bands))
+
+
+@backends
+def test_only_colours_matter_where_alpha_is_the_largest(backend):
+    """In every pixel, alpha would be above 0.99."""
+    scene = scene_of(((0, 0, 2), (9.0, 9.0, 9.0), 0.99999, (1.0, 0.5, 0)), dtype=torch.float64)
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in scene.tensors().items()}
+    image = render(scene.with_tensors(leaves, {}), straight(), backend=backend).rgb
+    torch.testing.assert_close(image, torch.tensor([0.99, 0.495, 0.0]).double().expand_as(image))
+    image.sum().backward()
+    changing = {name for name, leaf in leaves.items() if leaf.grad is not None and leaf.grad.any()}
+    assert changing == {"sh0"}

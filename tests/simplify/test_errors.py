@@ -169,3 +169,17 @@ def test_factors_of_errors_have_a_geometric_mean_of_one():
         power=1.0,
     )
     assert float(found.log().sum()) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_half_of_the_errors_of_neighbours_and_a_fiftieth_of_the_mean_are_added():
+    """Of four cells, each with the others as neighbours; the last one is not seen."""
+    found = factors_by_errors(
+        torch.eye(4)[:, :3],
+        errors=torch.tensor([1.0, 0.0, 0.0, torch.nan]).double(),
+        pixels=torch.tensor([1e12, 1e12, 1e12, 0.0]).double(),
+        power=0.5,
+    )
+    high, low = 1.0 + 0.02 * 0.625, 0.5 + 0.02 * 0.625
+    common = (high * low * low) ** (1 / 3)
+    wanted = [(high / common) ** 0.5, (low / common) ** 0.5, (low / common) ** 0.5, 1.0]
+    assert found.tolist() == pytest.approx(wanted)

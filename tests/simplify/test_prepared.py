@@ -153,3 +153,15 @@ def test_tensors_of_other_strides_give_the_same_bits(scene):
     simplifier = Simplifier("standard", device="cpu")
     wanted = simplifier.simplify(scene, 0.1)
     assert same_bits(simplifier.simplify(scene.with_tensors(tensors), 0.1), wanted)
+
+
+def test_a_further_attempt_computes_everything_again(monkeypatch):
+    """What is cached is on a device that lacked memory."""
+    notes = iter(["", "", "computed on the CPU", ""])
+    monkeypatch.setattr(
+        cvtgs.prepared, "within_memory", lambda compute, place, **_: compute(place, next(notes))
+    )
+    prepared = Simplifier(preset="draft", ckpt=None, device="cpu").prepare(random_scene(100))
+    reports = [prepared.run(0.1).report for _ in range(4)]
+    assert ["check" in stages(report) for report in reports] == [True, False, True, False]
+    assert [report.device_note for report in reports] == ["", "", "computed on the CPU", ""]

@@ -170,6 +170,15 @@ def test_a_view_is_too_close_at_less_than_half_of_the_usual_distance(monkeypatch
     assert found.centers[:, 0].tolist() == [chosen]
 
 
+@pytest.mark.parametrize(("size", "chosen"), [(0.049, 0), (0.051, 1)])
+def test_splats_no_larger_than_those_of_smooth_sides_are_no_fog(monkeypatch, size, chosen):
+    sizes = torch.tensor([size, 0.01, 0.01]).double()
+    monkeypatch.setattr(mixed, "splat_sizes", lambda *_: SplatSizes(sizes, sizes, sizes))
+    tried = [(cameras_on_a_line([0.0, 1.0, 2.0]), 1)]
+    (found,) = vars(mixed)["_sharp_ones"](SimpleNamespace(layout=None), tried)
+    assert found.centers[:, 0].tolist() == [chosen]
+
+
 @pytest.mark.parametrize(
     ("subject", "least", "most"), [(2.0, 0, 0), (4.3, 0, 0), (6.0, 1, 1), (8.0, 1.3, 3)]
 )
