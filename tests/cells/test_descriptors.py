@@ -67,6 +67,19 @@ def test_two_round_members_side_by_side():
     assert seen.weights.tolist() == [0.5, 0.5]
 
 
+def test_features_of_far_members_and_of_bright_ones_are_bounded():
+    """The third member is 50 deviations away on the bright side, and hardly moves the cell."""
+    row = random_scene(1, degree=0, dtype=torch.float64).select(torch.tensor([0, 0, 0]))
+    scene = row.with_tensors(
+        means=torch.tensor([[-1.0, 0, 0], [1, 0, 0], [60, 0, 0]]).double(),
+        log_scales=torch.full((3, 3), -0.7).double(),
+        logit_opacities=torch.tensor([0.0, 0.0, -13.0]).double(),
+        sh0=torch.tensor([0.0, 0.0, 100.0]).double()[:, None, None].expand(3, 1, 3),
+    )
+    seen = case_of(scene, torch.zeros(3).long(), visibility=torch.tensor([0.0, 1.0, 0.5]))
+    assert seen.describe().members[2, [14, 18]].tolist() == [3.0, 3.0]
+
+
 @pytest.mark.parametrize(
     ("seed", "tagged", "near"),
     [

@@ -188,3 +188,12 @@ def test_the_radius_of_groups_does_not_depend_on_the_order_of_rows():
     for _ in range(3):
         order = torch.randperm(6000, generator=generator)
         assert group_radius(points[order]) == wanted
+
+
+@pytest.mark.parametrize(("radius", "is_far"), [(5.0, True), (5.1, False)])
+def test_float32_points_are_far_from_the_origin_from_a_thousand_radii_on(radius, is_far):
+    center = torch.tensor([0.0, -5000.0, 0.0], dtype=torch.float64)
+    frame = RobustFrame(center=center, radius=radius)
+    origin = frame.far_origin(torch.zeros(1, 3))
+    assert (None if origin is None else origin.tolist()) == (center.tolist() if is_far else None)
+    assert frame.far_origin(torch.zeros(1, 3, dtype=torch.float64)) is None
