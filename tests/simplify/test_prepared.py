@@ -4,8 +4,12 @@ import pytest
 import torch
 
 import cvtgs
-from cvtgs import Simplifier, SimplifyConfig
+from cvtgs import Simplifier, SimplifyConfig, pipeline
+from cvtgs.analysis import analyze
+from cvtgs.clock import StageClock
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
+from cvtgs.grouping import order_rows
+from cvtgs.progress import silent
 from scenes import random_scene, same_bits
 
 SHARED = {"check", "plan", "visibility"}
@@ -165,3 +169,21 @@ def test_a_further_attempt_computes_everything_again(monkeypatch):
     reports = [prepared.run(0.1).report for _ in range(4)]
     assert ["check" in stages(report) for report in reports] == [True, False, True, False]
     assert [report.device_note for report in reports] == ["", "", "computed on the CPU", ""]
+
+
+def test_cached_moments_are_not_used_with_other_masses(monkeypatch):
+    found, allocate = [], pipeline.allocate
+    monkeypatch.setattr(
+        pipeline, "allocate", lambda points, *rest: found.append(points) or allocate(points, *rest)
+    )
+    scene, config = random_scene(60), SimplifyConfig.from_preset("draft")
+    analysis, clock = analyze(scene, config), StageClock(silent, torch.device("cpu"))
+    ordered = order_rows(scene, analysis, config)
+    for importance in (None, torch.full((60,), 3.0).double()):
+        pipeline.reduce_scene(
+            scene, analysis, 10, config,
+            net=None, clock=clock, ordered=ordered, importance=importance,
+        )  # fmt: skip
+    assert found[0].moments is ordered.points.moments
+    assert found[1].moments is None
+    torch.testing.assert_close(found[1].apparent_masses, 3.0 * found[0].apparent_masses)
