@@ -17,6 +17,7 @@ from format_oracles import Splat
 from scenes import moved, random_scene
 
 DATA = Path(__file__).parent / "data" / "formats"
+WRITABLE = ".compressed.ply, .ply, .spz, .splat, .sog, .spz.glb, .glb, .gltf or .usda"
 
 
 def storable_scene(count: int, *, seed: int = 0, degree: int = 3) -> GaussianScene:

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import product
 from pathlib import Path
 from typing import Self
 
@@ -16,6 +17,7 @@ from cvtgs.evaluation import Evaluation, SceneScores
 from cvtgs.io import check_output, check_save, load, save, scene_size
 from cvtgs.io.atomic import make_folder, write_atomically
 from cvtgs.io.axes import SCENE_AXES, checked_axes
+from cvtgs.io.formats import READABLE_SUFFIXES, WRITABLE_SUFFIXES
 from cvtgs.report import Level, check_one_scene
 from cvtgs.text import counted, printable_name, shown
 
@@ -101,10 +103,11 @@ def check_levels(
     folder: str | os.PathLike[str], names: Sequence[str], *, overwrite: bool = False
 ) -> None:
     """Make the folder and check that levels can be written, before any long computation."""
-    for name in names:
-        if name.lower().endswith(".usda"):  # the only write-only format
+    ends = (end for end in WRITABLE_SUFFIXES if not end.endswith(READABLE_SUFFIXES))
+    for name, end in product(names, ends):
+        if name.lower().endswith(end):
             raise InvalidArgumentError(
-                "levels need a format that cvtgs can also read, found '.usda'; write them as "
+                f"levels need a format that cvtgs can also read, found {end!r}; write them as "
                 ".ply and convert those files."
             )
     make_folder(folder)

@@ -15,6 +15,7 @@ from cvtgs.io import load, losses, save
 from cvtgs.io.ply import write
 from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 from cvtgs.text import shown
+from format_cases import WRITABLE
 from ply_files import gaussian_properties, gaussian_rows, parse_header, write_ply_file
 from scenes import random_scene
 
@@ -288,6 +289,5 @@ def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError) as caught:
         save(make_scene(), tmp_path / "s.ckpt")
     assert str(caught.value) == (
-        f"{tmp_path}/s.ckpt: the name must end in .compressed.ply, .ply, .spz, .splat, .sog, "
-        f".spz.glb, .glb, .gltf or .usda, found the suffix '.ckpt'."
+        f"{tmp_path}/s.ckpt: the name must end in {WRITABLE}, found the suffix '.ckpt'."
     )

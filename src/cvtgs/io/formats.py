@@ -277,13 +277,13 @@ def losses(scene: GaussianScene, path: str | os.PathLike[str], *, spz_version: i
     dotted = f".{os.fspath(path)}"
     named = dotted if dotted.lower() in _WRITERS else path
     suffix = _suffix_of(named, _WRITERS)
-    limits = SPZ_2 if suffix == ".spz" and spz_version == 2 else FORMAT_LIMITS.get(suffix)
-    if limits is None:
+    if suffix == ".ply":
         from cvtgs.io.ply.write import lost_scales  # noqa: PLC0415 (only where written)
 
         lost = lost_scales(scene)
         dropped = (lost,) if lost else ()
         return Losses(dropped=dropped, changed=(), count=len(scene), sh_degree=scene.sh_degree)
+    limits = SPZ_2 if suffix == ".spz" and spz_version == 2 else FORMAT_LIMITS[suffix]
     return losses_within(scene, limits)
 
 
