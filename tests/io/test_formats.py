@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 import cvtgs
+from cvtgs.cli.options import READABLE, WRITABLE
+from cvtgs.cli.paths import FILE_SUFFIXES
 from cvtgs.io.formats import READABLE_SUFFIXES, WRITABLE_SUFFIXES
 from cvtgs.io.limits import FORMAT_LIMITS
 
@@ -16,6 +18,15 @@ def test_every_format_but_ply_has_limits():
     missing = {*WRITABLE_SUFFIXES} - {".ply"} - FORMAT_LIMITS.keys()
     assert not missing, "say in FORMAT_LIMITS of io/limits.py what files of the format lose"
     assert not FORMAT_LIMITS.keys() - {*WRITABLE_SUFFIXES}
+
+
+def test_help_names_every_format():
+    written, read = (set(re.findall(r"[\w-]*(?:\.\w+)+", text)) for text in (WRITABLE, READABLE))
+    assert written == set(WRITABLE_SUFFIXES), "name the formats in WRITABLE of cli/options.py"
+    known = {*READABLE_SUFFIXES, "meta.json", "lod-meta.json"}
+    assert read == known, "name the formats in READABLE of cli/options.py"
+    others = [name for name in written if not name.endswith(FILE_SUFFIXES)]
+    assert not others, "a folder may not have such a name: add it to _SCENES in cli/paths.py"
 
 
 @pytest.mark.parametrize(

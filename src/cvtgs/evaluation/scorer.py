@@ -291,21 +291,21 @@ def scene_scores(
     name: str, count: int, rows: Sequence[ImageScores], *, blind: Sequence[int] = ()
 ) -> SceneScores:
     """Average the scores of a scene, one row per view, without blind views unless all are."""
-    psnrs, ssims, distances, errors, biases = zip(*rows, strict=True)
-    has_alpha = not any(map(math.isnan, errors))
+    has_alpha = not any(math.isnan(row.alpha_error) for row in rows)
     counted = [view for view in range(len(rows)) if view not in blind] or range(len(rows))
 
-    def score(values: tuple[float, ...]) -> Score:
+    def score(metric: str) -> Score:
+        values = tuple(getattr(row, metric) for row in rows)
         return Score(mean=Score.of([values[view] for view in counted]).mean, views=values)
 
     return SceneScores(
         name=name,
         count=count,
-        psnr=score(psnrs),
-        ssim=score(ssims),
-        lpips=None if None in distances else score(distances),
-        alpha_error=score(errors) if has_alpha else None,
-        alpha_bias=score(biases) if has_alpha else None,
+        psnr=score("psnr"),
+        ssim=score("ssim"),
+        lpips=None if any(row.lpips is None for row in rows) else score("lpips"),
+        alpha_error=score("alpha_error") if has_alpha else None,
+        alpha_bias=score("alpha_bias") if has_alpha else None,
     )
 
 
