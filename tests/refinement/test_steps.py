@@ -44,6 +44,19 @@ def test_the_loss_of_a_step_is_the_mean_over_its_images():
     torch.testing.assert_close(*losses)
 
 
+def test_every_weight_of_the_loss_counts():
+    full, small = full_scene(200), small_scene(full_scene(200))
+
+    def loss_of(**weights: float) -> float:
+        config = quick(first_images=3, **weights)
+        images = ImageBuffer(full, three_views(), config=config, seed=0)
+        return mean_loss(small, images, config).item()
+
+    for name in RefineConfig.model_fields:
+        if name.endswith("_weight"):
+            assert loss_of(**{name: 3.0}) != loss_of(), f"pass {name} in mean_loss"
+
+
 def test_images_of_all_sizes_weigh_the_same_in_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of four images, three have one size and one has another."""
     full, small = full_scene(200), small_scene(full_scene(200))

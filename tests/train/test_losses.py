@@ -69,6 +69,15 @@ def test_the_loss_is_the_weighted_sum_of_its_parts():
         assert loss == pytest.approx(wanted, rel=1e-4)
 
 
+def test_every_weight_of_images_counts():
+    """The size of residuals alone has another place, :func:`_residual_penalty`."""
+    image, target = images()
+    usual = view_loss(image, target, LossConfig()).item()
+    for name in sorted(LossConfig.model_fields.keys() - {"residual_weight"}):
+        other = view_loss(image, target, LossConfig(**{name: 3.0})).item()
+        assert other != usual, f"pass {name} in view_loss of train/losses.py"
+
+
 def test_doubling_the_error_costs_the_same_at_any_error():
     image, target = images()
     config = LossConfig(mse_weight=1.0, image_weight=0.0)
