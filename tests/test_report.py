@@ -26,6 +26,7 @@ from cvtgs.evaluation import Comparison, LpipsWeights
 from cvtgs.mergenet import Residuals, load_checkpoint
 from cvtgs.progress import silent
 from cvtgs.rendering import ObservedViews
+from cvtgs.streams import StreamChunk, plan_stream
 from cvtgs.text import short_repr
 from cvtgs.views import CameraPositions
 from scenes import random_scene
@@ -144,6 +145,12 @@ def test_the_silent_listener_prints_nothing(capsys):
     assert capsys.readouterr().out == ""
 
 
+def test_a_printed_report_is_one_line():
+    report = report_of()
+    assert f"{report}" == str(report) == repr(report)
+    assert repr(report).startswith("SimplifyReport(10 -> 1 Gaussian, ")
+
+
 def test_records_with_dictionaries_are_not_hashable():
     assert not isinstance(report_of(), Hashable)
     assert not isinstance(describe(random_scene(3)), Hashable)
@@ -158,6 +165,7 @@ def test_records_with_dictionaries_are_not_hashable():
         LpipsWeights,
         ObservedViews,
         Residuals,
+        StreamChunk,
         Tessellation,
     ],
 )
@@ -168,9 +176,11 @@ def test_values_of_many_numbers_have_a_short_repr(kind):
 def test_objects_with_tensors_have_a_short_repr():
     scene = random_scene(1200)
     prepared = Simplifier(preset="draft", device="cpu").prepare(scene)
-    level = prepared.levels([0.01])[0]
+    level, coarse = prepared.levels([0.01, 0.005])
     assert repr(prepared) == f"Prepared({scene!r}, preset draft, device cpu)"
     assert repr(level) == f"Level({level.scene!r}, {level.report!r}, error {level[2]:.3g})"
+    plan = plan_stream([level, coarse])
+    assert repr(plan) == "StreamPlan(levels of 12, 6 Gaussians, 1 chunk)"
     eye = torch.eye(4)[None]
     cameras = Cameras(viewmats=eye, Ks=eye[:, :3, :3], width=30, height=20)
     assert repr(cameras) == "Cameras(1 of 30 x 20 pixels, cpu)"

@@ -216,6 +216,8 @@ class SimplifyReport(CellStatistics):
             f"{self.device})"
         )
 
+    __str__ = __repr__
+
 
 class Simplified(NamedTuple):
     """A simplified scene and its report.

@@ -23,7 +23,7 @@ from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import rotation_matrices
 from cvtgs.report import check_one_scene
 from cvtgs.scene import GaussianScene
-from cvtgs.text import shown
+from cvtgs.text import counted, short_repr, shown
 
 CHUNK_GAUSSIANS = 1 << 15
 """Maximum number of finest Gaussians in a chunk, unless one coarse Gaussian replaces more."""
@@ -78,6 +78,8 @@ class StreamChunk:
     box_min: Corner
     box_max: Corner
 
+    __repr__ = short_repr
+
 
 class StreamNode(NamedTuple):
     """A node of the tree of chunks.
@@ -110,6 +112,11 @@ class StreamPlan(NamedTuple):
     chunks: tuple[StreamChunk, ...]
     root: StreamNode
     far: tuple[Int[Tensor, "k"], ...] = ()
+
+    def __repr__(self) -> str:
+        """Return the numbers of Gaussians and chunks, not the rows."""
+        sizes = ", ".join(f"{len(level.scene):,}" for level in self.levels)
+        return f"StreamPlan(levels of {sizes} Gaussians, {counted(len(self.chunks), 'chunk')})"
 
     @property
     def environment(self) -> GaussianScene | None:
