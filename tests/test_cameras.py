@@ -264,6 +264,13 @@ def test_about_every_second_camera_sees_a_larger_image():
     assert four.in_two_sizes(1) is four
 
 
+def test_a_loop_over_cameras_gives_single_ones():
+    two = Cameras(**GOOD).select([0, 0]).every(2)
+    assert [len(camera) for camera in two] == [1, 1]
+    assert next(iter(two)).strides == (2,)
+    assert list(two.select([])) == []
+
+
 def test_about_every_third_camera_ignores_the_tag():
     four = Cameras(**GOOD).select(torch.zeros(4, dtype=torch.int64)).in_both_modes()
     assert four.ignores_tag == (False, False, True, False)

@@ -1,7 +1,7 @@
 """Pinhole cameras, and view matrices from camera positions and targets."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, Self
@@ -122,8 +122,11 @@ class Cameras:
 
     __getitem__ = select
 
+    def __iter__(self) -> Iterator[Self]:
+        return iter(self.singles())
+
     def singles(self) -> list[Self]:
-        """Return one :class:`Cameras` per camera, in order."""
+        """Return one :class:`Cameras` per camera, in order, as ``for one in cameras`` does."""
         if len(self) == 1:  # a selection would copy the row number to the device
             return [self]
         return [self[[row]] for row in range(len(self))]
