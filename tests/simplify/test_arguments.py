@@ -228,7 +228,8 @@ def test_arguments_of_another_kind_are_one_sentence(tmp_path):
     with pytest.raises(InvalidArgumentError, match="cameras must be Cameras, for example of"):
         cvtgs.render(scene, "cameras.json")
     for wrong in (None, b"bytes"):
-        with pytest.raises(InvalidArgumentError, match="from a path or an open binary file"):
+        text = r"from a path or an open binary file \(io.BytesIO of bytes\), found"
+        with pytest.raises(InvalidArgumentError, match=text):
             cvtgs.load(wrong)
     with pytest.raises(InvalidArgumentError, match=r"must be a GaussianScene, found 'a\.ply'"):
         cvtgs.save("a.ply", tmp_path / "z.ply")

@@ -131,7 +131,8 @@ def load(
     if not isinstance(path, str | os.PathLike):
         if not hasattr(path, "read"):
             raise InvalidArgumentError(
-                f"a scene is read from a path or an open binary file, found {shown(path)}."
+                f"a scene is read from a path or an open binary file (io.BytesIO of bytes), "
+                f"found {shown(path)}."
             )
         if format is not None:
             format = _suffix_of(_dotted(format) or "", _READERS, format=format)
