@@ -254,7 +254,7 @@ def test_repr_shows_no_values():
         ("quats", (4, 3), "(4, 4)"),
         ("quats", (3, 4), "(4, 4)"),
         ("log_scales", (4, 1), "(4, 3)"),
-        ("logit_opacities", (4, 1), "(4)"),
+        ("logit_opacities", (4, 1), "(4,)"),
         ("sh0", (4, 3), "(4, 1, 3)"),
         ("shN", (4, 9), "(4, k, 3)"),
     ],

@@ -104,10 +104,9 @@ class GaussianScene:
         shapes = (n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, bands, 3)
         for (name, tensor), shape in zip(tensors.items(), shapes, strict=True):
             if tuple(tensor.shape) != shape:
-                sizes = {"means": ("n", 3), "shN": (n, "k", 3)}.get(name, shape)
+                wanted = {"means": "(n, 3)", "shN": f"({n}, k, 3)"}.get(name, shape)
                 raise InvalidSceneError(
-                    f"{name} must have shape ({', '.join(map(str, sizes))}), "
-                    f"found {tuple(tensor.shape)}."
+                    f"{name} must have shape {wanted}, found {tuple(tensor.shape)}."
                 )
             if tensor.dtype != dtype or tensor.device != device:
                 raise InvalidSceneError(
