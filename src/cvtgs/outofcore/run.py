@@ -98,7 +98,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         sh_degree: SH bands above this degree are dropped; None keeps all.
         source_axes: Directions of x, y and z in the source; None for those of PLY files.
         output_axes: Directions of x, y and z in the output; None for those of its format.
-        simplifier: Configuration and network; None for the defaults.
+        simplifier: Configuration and network, not its listener; None for the defaults.
         cameras: Cameras for presets that render the scene; None takes those beside the source if
             it has the axes of PLY files (:func:`cvtgs.views.find_own_cameras`), or else generates
             views.

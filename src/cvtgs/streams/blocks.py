@@ -197,7 +197,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
         axes: Axes of the input file and of the output; those of 3D Tiles are fixed, so their
             output must be ``rdf``.
         sh_degree: Highest SH degree to keep; None keeps all.
-        simplifier: Configuration and network; None for the defaults.
+        simplifier: Configuration and network, not its listener; None for the defaults.
         workers: Call functions for ranges of the file and for blocks; None calls them one after
             the other in this process.
         overwrite: Whether files of an earlier stream may be replaced.
