@@ -124,6 +124,7 @@ def test_json_holds_every_field():
     assert [stage["stage"] for stage in values["stages"]][-2:] == ["merge", "network"]
     assert values["checkpoint"] == "standard"
     assert values["version"] == cvtgs.__version__
+    assert values["torch_version"] == torch.__version__
     assert report.to_json().endswith("}\n")
 
 

@@ -7,6 +7,7 @@ from pkgutil import resolve_name
 from typing import Literal, NamedTuple, Self
 
 import pydantic
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -175,6 +176,7 @@ class SimplifyReport(CellStatistics):
         search: Report of the search for the count; None if it was given.
         config: The configuration.
         version: Version of cvtgs that made the result.
+        torch_version: Version of torch, with its build; others may round differently.
     """
 
     input_count: int
@@ -200,6 +202,7 @@ class SimplifyReport(CellStatistics):
     search: SearchReport | None = None
     config: SimplifyConfig
     version: str = pydantic.Field(default_factory=partial(resolve_name, "cvtgs:__version__"))
+    torch_version: str = str(torch.__version__)
 
     __hash__ = None  # type: ignore[assignment]  # compared by value, and has a dictionary
 
