@@ -284,7 +284,7 @@ ENDLESS = {
 
 
 @pytest.mark.parametrize(("text", "end"), ENDLESS.values(), ids=ENDLESS)
-@pytest.mark.slow
+@pytest.mark.long
 def test_errors_about_huge_files_are_short(tmp_path, text, end):
     path = tmp_path / "config.toml"
     path.write_text(text, encoding="utf-8")

@@ -317,7 +317,7 @@ def test_targets_belong_to_cells_and_not_to_protected_gaussians(monkeypatch):
     assert float(targets.sum()) == pytest.approx(float(shown.sum()), rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_level_is_matched(scene):
     simplifier = Simplifier(config=preset(), device="cpu")
     levels = simplifier.levels(scene, [0.1, 0.02])

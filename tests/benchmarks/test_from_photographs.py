@@ -26,7 +26,7 @@ def dataset(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_pictures_are_laid_out_as_nerf_s_with_an_eighth_for_testing(dataset):
     train, test = (read_split(dataset, split, SIZE) for split in ("train", "test"))
     assert (len(train[0]), len(test[0])) == (14, 2)

@@ -134,7 +134,7 @@ def test_large_cells_are_described_by_a_sample():
     torch.testing.assert_close(seen.cells[:, 12], 0.3 * depths.log(), rtol=0.0, atol=0.03)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_samples_estimate_the_totals_of_all_members():
     case = some_case(900, 3)
     seen, sampled = case.describe(), sample_members(case.scene, case.part)

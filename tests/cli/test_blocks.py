@@ -133,7 +133,7 @@ def test_a_time_budget_chooses_no_preset_whose_images_do_not_fit(
     assert "Preset standard, the best that fits into 3600 s and, without images, into 700MB" in text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_quality_is_not_searched_in_less_memory_than_its_images_need(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -212,7 +212,7 @@ def wait_for_handler(pid: int, number: int) -> None:
     raise TimeoutError("the process never caught the signal")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_error_of_python_m_cvtgs_prints_no_traceback():
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     result = run_cvtgs("info", "missing.ply", env=environment)

@@ -22,7 +22,7 @@ def source(tmp_path) -> Path:
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_steps_are_in_the_report_and_the_summary(source, tmp_path, capsys):
     output, report = tmp_path / "out.ply", tmp_path / "report.json"
     words = ["simplify", str(source), str(output), "--rho", "0.1", "--report", str(report)]
@@ -38,7 +38,7 @@ def test_steps_are_in_the_report_and_the_summary(source, tmp_path, capsys):
     assert " refine " in " ".join(printed.split())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_steps_of_the_option_are_not_multiplied_for_few_gaussians(source, tmp_path):
     report = tmp_path / "report.json"
     words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.1"]

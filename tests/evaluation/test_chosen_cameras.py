@@ -38,7 +38,7 @@ def test_a_scene_in_memory_is_scored_from_automatic_views(scene, small, score):
     assert len(found.views) == 8
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_file_is_scored_as_the_command_does(scene, small, tmp_path, capsys):
     full, other = tmp_path / "full.ply", tmp_path / "small.ply"
     cvtgs.save(scene, full)
@@ -58,7 +58,7 @@ def test_photographs_need_their_cameras(scene, small):
         evaluate(scene, small, photographs=torch.zeros(8, 480, 640, 3), settings=OFF)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_gaussians_that_are_not_drawn_are_told(scene, small):
     means = scene.means.clone()
     means[:3] = torch.nan

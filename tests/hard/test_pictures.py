@@ -150,7 +150,7 @@ def check_that_scores_are_numbers(scene):
 
 
 @near_plane
-@pytest.mark.slow
+@pytest.mark.long
 @each_case
 def test_images_are_no_worse_than_mass_pruning(make, subtests):
     """Compared by automatic views, at a fifth of the count; PSNR is capped at 50 dB."""

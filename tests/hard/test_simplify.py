@@ -104,7 +104,7 @@ def check_another_order(scene, preset, count, small):
     assert_same_gaussians(small, other)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @each_case
 def test_each_case_in_another_unit_shifted_and_turned(make, subtests):
     """Check float64 scenes in another unit, shifted by twice their size, and turned."""

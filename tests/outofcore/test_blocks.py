@@ -200,7 +200,7 @@ def test_the_size_of_ranges_does_not_matter(source, tmp_path):
     assert same_bits(cvtgs.load(tmp_path / "a.ply"), cvtgs.load(tmp_path / "b.ply"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_sums_do_not_depend_on_ranges(scene, source, monkeypatch):
     monkeypatch.setattr("cvtgs.outofcore.scan.CHUNK", 10)
     rows, frame = open_rows(source), robust_frame(scene.means)

@@ -90,7 +90,7 @@ def test_without_the_package_the_error_says_what_to_install(monkeypatch):
         connect("tcp://127.0.0.1:1")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore")
 def test_a_relative_path_starts_at_the_folder_of_the_caller(cluster, source, tmp_path, monkeypatch):
     monkeypatch.chdir(source.parent)

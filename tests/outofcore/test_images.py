@@ -70,7 +70,7 @@ def test_a_scene_too_small_for_the_near_plane_is_warned_about_once(scene, tmp_pa
     assert sum("of the Gaussians before their cameras" in text for text in texts) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nobody_is_asked_for_better_cameras_than_generated_ones(scene, tmp_path):
     """They are far away from Gaussians that all have one position."""
     point = scene.with_tensors({"means": torch.full_like(scene.means, 3.0)})[:800]
@@ -229,7 +229,7 @@ def test_images_raise_the_least_memory(source, tmp_path):
         in_blocks(source, tmp_path / "no.ply", MATCHED, blocks=None, memory=least - 1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_tag_that_is_switched_off_does_not_change_views(scene, tmp_path, monkeypatch):
     cvtgs.save(replace(scene, comments=(ANTIALIASED.text,)), tmp_path / "in.ply")
     looks, real = [], module.observe
@@ -240,7 +240,7 @@ def test_a_tag_that_is_switched_off_does_not_change_views(scene, tmp_path, monke
     assert all(torch.equal(views.viewmats, wanted.viewmats) for views in looks)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("boxes", [(), (Box(min=(-99, -99, 0.4), max=(99, 99, 99)),)])
 def test_blocks_of_flat_gaussians_that_become_thick_are_matched(scene, tmp_path, boxes):
     """Their simplified Gaussians have three scales, the full ones two."""

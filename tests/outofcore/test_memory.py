@@ -333,6 +333,7 @@ def test_files_take_nearly_as_much_of_the_disk_as_estimated(
     assert_estimate(tmp_path, monkeypatch, rho=rho, degree=degree, blocks=blocks)
 
 
+@pytest.mark.long
 def test_files_of_runs_with_given_cameras_take_nearly_as_much_as_estimated(tmp_path, monkeypatch):
     """There, cells exist twice, and the errors of each image."""
     visibility = {"views": 12, "size": 100, "stride": 1}

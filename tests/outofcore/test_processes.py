@@ -176,6 +176,7 @@ def starting(tmp_path):
         running.kill()
 
 
+@pytest.mark.long
 @on_posix
 def test_an_interrupt_does_not_reach_starting_workers(starting):
     for pid in starting.stdout.readline().split():
@@ -191,6 +192,7 @@ def test_the_end_does_not_wait_for_calls_whose_results_nothing_takes(starting):
     assert starting.returncode == 0
 
 
+@pytest.mark.long
 @on_posix
 def test_workers_of_a_killed_process_remove_its_temporary_folder(starting, tmp_path):
     starting.stdout.readline()
@@ -351,6 +353,7 @@ def test_a_pool_may_be_broken_before_its_starts_have_failed():
     assert str(error).startswith("no worker process could start")
 
 
+@pytest.mark.long
 def test_a_script_without_a_guard_is_told_why_no_process_starts(tmp_path):
     script = tmp_path / "script.py"
     script.write_text("""

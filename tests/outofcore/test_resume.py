@@ -377,7 +377,7 @@ def test_a_run_continues_with_its_blocks_if_the_memory_is_enough(
     assert not (tmp_path / ".out.ply.blocks").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_blocks_that_were_asked_for_are_used(source, tmp_path):
     output = tmp_path / "out.ply"
     with pytest.raises(StoppedError):

@@ -133,7 +133,7 @@ def finish(folder, config, listener=silent):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_job_with_damaged_views_starts_over(scene, tmp_path):
     config = SimplifyConfig.from_mapping(SETTINGS)
     job = run(scene, tmp_path, config)

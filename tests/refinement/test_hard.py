@@ -141,7 +141,7 @@ def test_other_kinds_of_scenes(kind):
     assert refine(small_scene(full), full, steps=10, config=quick()).report.gain >= 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_antialiased_scenes_are_rendered_antialiased():
     full = full_scene()
     object.__setattr__(full, "comments", ("SplatRenderMode: mip",))

@@ -137,7 +137,7 @@ def test_gaussians_that_cannot_be_rendered_do_not_move():
     assert factors[7] > 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_refinement_moves_merged_gaussians_but_not_exact_ones():
     full = full_scene(500)
     small = discolored(small_scene(full, 0.5), 0.5)

@@ -57,7 +57,7 @@ def test_an_unknown_backend_is_refused():
     assert str(caught.value) == "backend must be one of auto, torch, numba, gsplat, found 'cuda'."
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_numba_auto_takes_torch_and_numba_is_refused():
     lines = python(
         "import sys\n"
@@ -202,7 +202,7 @@ def test_numba_is_installed_with_the_package_where_it_has_wheels():
     assert not found.marker.evaluate({**here, "platform_machine": "ppc64le"})
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_importing_loads_no_optional_package():
     lines = python(
         "import sys\n"

@@ -285,7 +285,7 @@ def test_wrong_cameras_are_refused(backend, changes, wish):
     assert str(caught.value) == f"cameras must have {wish}; 1 of 1 do not, the first is camera 0."
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not find_spec("numba"), reason="needs numba")
 def test_images_larger_than_the_memory_are_refused():
     huge = replace(straight(dtype=torch.float32), width=10**9, height=10**9)

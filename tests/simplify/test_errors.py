@@ -80,7 +80,7 @@ def test_a_scene_that_stays_whole_and_a_preset_without_images_are_not_affected()
     assert same(plain, Simplifier(device="cpu").simplify(full(), count=COUNT))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_levels_and_repeated_runs_have_the_bits_of_single_runs():
     wanted = matched(1.0).simplify(full(), count=COUNT, cameras=given_cameras())
     prepared = matched(1.0).prepare(full(), cameras=given_cameras())

@@ -95,7 +95,7 @@ def test_groups_far_apart_are_seen_from_near(near, distance):
     assert psnr(near, corrected) > alone - 1.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_groups_far_apart_in_blocks(near, tmp_path):
     both = cvtgs.concatenate([near, moved_to(near, torch.tensor([1e3, 0.0, 0.0]))])
     cvtgs.save(both, tmp_path / "both.ply")
@@ -104,7 +104,7 @@ def test_groups_far_apart_in_blocks(near, tmp_path):
     assert psnr(near, cvtgs.load(tmp_path / "small.ply")) > psnr(near, whole) - 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_far_landscapes_are_contracted_about_their_centre():
     near = cvtgs.synthetic.scene("landscape", 6000, sh_degree=0, seed=1)
     near = near.with_tensors(means=(near.means * 64).round() / 64)

@@ -154,7 +154,7 @@ def test_files_in_parts(scene, tmp_path, work, setting):
     assert all(same_bits(one, other) for one, other in zip(found, wanted, strict=True))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings
 @pytest.mark.parametrize("find", [automatic_views, mixed_views])
 def test_views(scene, setting, find):
@@ -175,7 +175,7 @@ def test_seeds(setting):
     assert all(map(torch.equal, found, wanted))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings
 def test_positions_above_a_floor(setting):
     scene = make("courtyard", 500, sh_degree=0, seed=1)
@@ -186,7 +186,7 @@ def test_positions_above_a_floor(setting):
     assert torch.equal(found.eyes, wanted.eyes)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @backends
 @settings
 def test_contributions(scene, setting, backend):

@@ -221,7 +221,7 @@ def test_invalid_rows_are_counted(tmp_path: Path, scene: GaussianScene) -> None:
     assert [level.gaussians for level in report.levels] == [3998, 1000, 200, 50]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_axes_and_sh_degree_are_applied(tmp_path: Path) -> None:
     save(make("courtyard", 1000, sh_degree=1, seed=3), tmp_path / "scene.ply")
     stream(tmp_path / "scene.ply", tmp_path / "full")

@@ -59,7 +59,7 @@ def test_arguments_of_another_kind_are_named(tmp_path: Path, scene: GaussianScen
             measure_tradeoff(tmp_path / "in.ply", **({"presets": ["draft"]} | changes))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_names_may_begin_with_a_dash(tmp_path, scene, monkeypatch):
     monkeypatch.chdir(tmp_path)
     cvtgs.save(scene, "-in.ply")

@@ -384,6 +384,6 @@ def test_a_large_screen_shows_all_columns(measured, tmp_path):
     assert in_frame(path, f"{table}.clientWidth", width=1080) == "1016"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page_loads_nothing_from_the_network(page):
     assert not re.search(r"https?://", page.read_text(encoding="utf-8"))

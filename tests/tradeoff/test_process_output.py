@@ -16,7 +16,7 @@ def test_the_output_of_a_process_on_windows_is_read(monkeypatch):
         run_process([sys.executable, "-c", "import sys; sys.exit('K\\xfcche is missing')"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_start_of_a_run_is_measured_as_the_command_line_starts(monkeypatch):
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     shown = "import os; print(os.environ.get('OMP_WAIT_POLICY'), gc.get_freeze_count() > 0)"

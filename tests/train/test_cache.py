@@ -92,7 +92,7 @@ def test_cases_take_no_memory(source, tmp_path):
         assert files.pop().startswith(str(tmp_path))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_cached_results_equal_fresh_ones(source, made, tmp_path):
     config = config_of()
     for prepared in (

@@ -42,7 +42,7 @@ def results_of(config: TrainConfig, cache: Path, step: int = 3) -> list[train_lo
         return compute(small_net(), step)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_cases_of_a_step_differ_and_are_the_same_every_time(scenes, cache):
     config = config_of(scenes, cases_per_step=4)
     results = results_of(config, cache)

@@ -68,7 +68,7 @@ def test_an_unseen_scene_gains(trained):
     assert trained.history.best().mean_gain > 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_training_scene_gains_in_unseen_views(trained):
     """Other views, at another ratio, through the simplifier and the file that was written."""
     scene = small_scene(COUNT, seed=0)

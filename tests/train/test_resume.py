@@ -112,7 +112,7 @@ def test_a_run_interrupted_during_validation_can_be_resumed(
 
 
 @pytest.mark.usefixtures("_quick_curves")
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_interrupted_between_checkpoint_and_state_can_be_resumed(
     scenes, cache, tmp_path, monkeypatch
 ):

@@ -310,7 +310,7 @@ def test_automatic_views_among_mixed_ones_are_all_around(count):
     assert float(gaps.amax()) < 1.2 * math.tau / (count // 4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_same_scene_gives_the_same_positions():
     scene = turned("courtyard", CONVENTIONS["y-down"])
     one, two = (find_view_positions(scene) for _ in range(2))
