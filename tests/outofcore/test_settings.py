@@ -126,7 +126,7 @@ def usual(in_piece: Results, in_blocks: Results) -> dict[str, list[torch.Tensor]
     return {"piece": in_piece({}), "blocks": in_blocks({})}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("key", OTHERS)
 def test_a_setting_applies_in_blocks(key: str, usual, in_piece: Results, in_blocks: Results):
     section, name = key.split(".")
